@@ -25,7 +25,6 @@ from math import inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from gains.core._bracketing import local_maxima, may_reach_zero
 from gains.core.arrays import ComplexArray, FloatArray
@@ -65,7 +64,7 @@ _WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
 _SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
 # halvings between two looks, after how many a solution is searched, from how many angles; and equal mismatches
 _HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 3, 1e-9
-# largest change of log det(I - N) between neighbouring angles, into how many parts they are divided for that and how
+# largest relative change of det(I - N) between neighbouring angles, into how many parts they are divided for that, how
 # often, and the modulus of a zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
 
@@ -81,8 +80,7 @@ def block_window(plant: HeldPlant, timing: Timing, assumed_s: float) -> tuple[fl
         return assumed_s, assumed_s
     if not plant.K.any():
         return 0.0, inf
-    loop = _PredictedBlock(plant, timing, assumed_s)
-    shorter_s, longer_s = (loop.end_s(way) for way in (-1.0, 1.0))
+    shorter_s, longer_s = _PredictedBlock(plant, timing, assumed_s).ends_s()
     return max(0.0, assumed_s - shorter_s), assumed_s + longer_s
 
 
@@ -138,6 +136,14 @@ class _Answers(NamedTuple):
     of_v: FloatArray
 
 
+class _Looks(NamedTuple):
+    """Mismatches (s) in one direction: where the loop is judged, beside the likeliest end, and all likely ends."""
+
+    all_s: list[float]
+    likely_s: list[float]
+    ends_s: FloatArray
+
+
 class _PredictedBlock:
     """I - N of one block at any z on the unit circle and any true delay."""
 
@@ -177,23 +183,37 @@ class _PredictedBlock:
         self.by_assumed = self._answers(np.array([assumed_s]))
         self.grid = self._grid(self._angles())
         self.aside_s = self._refined(*self._starts())
+        self.stable = dict[float, bool]()
 
-    def end_s(self, way: float) -> float:
-        """How far (s) from the assumed delay the window ends in one direction."""
+    def ends_s(self) -> tuple[float, float]:
+        """How far (s) from the assumed delay the window ends below and above it."""
+        below, above = (self._looks(way) for way in (-1.0, 1.0))
+        # judged in one go: at many small matrices, the number of calls takes the time
+        self._judge(
+            [self.assumed_s + way * look for way, own in ((-1.0, below), (1.0, above)) for look in own.likely_s]
+        )
+        return self._end_s(-1.0, below), self._end_s(1.0, above)
+
+    def _looks(self, way: float) -> _Looks:
         ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
         ends_s = np.sort(ends_s[ends_s > _AT_ASSUMED * self.tick_s])
         known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
-        looks = [*self._kinks(way, max(known_s, float(ends_s.max(initial=0.0)))), (1.0 - _BESIDE) * known_s]
+        likely, looks = [(1.0 - _BESIDE) * known_s], self._kinks(way, max(known_s, float(ends_s.max(initial=0.0))))
         if not self.by_loci:  # these miss no crossing in between but those of a short stretch around a kink
             looks += [share * known_s for share in _WITHIN]
         if ends_s.size or (not self.by_loci and way > 0.0):
+            likely.append((1.0 + _BESIDE) * known_s)
             last_s = min(longest_s, _SEARCHED * known_s + _SEARCHED_PERIODS * self.common_s)
             farther = _FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))
-            looks += [*((1.0 + _BESIDE) * ends_s), (1.0 + _BESIDE) * known_s, *(farther * known_s)]
+            looks += [*((1.0 + _BESIDE) * ends_s).tolist(), *(farther * known_s).tolist()]
+        likely = [min(longest_s, look) for look in likely]
+        return _Looks(sorted({*likely, *(min(longest_s, look) for look in looks)}), likely, ends_s)
+
+    def _end_s(self, way: float, looks: _Looks) -> float:
         stable_s = 0.0
-        for aside_s in sorted(min(longest_s, float(look)) for look in looks):
+        for aside_s in looks.all_s:
             if not self._is_stable(self.assumed_s + way * aside_s):
-                return self._between(way, stable_s, aside_s, ends_s)
+                return self._between(way, stable_s, aside_s, looks.ends_s)
             stable_s = aside_s
         return inf
 
@@ -237,7 +257,7 @@ class _PredictedBlock:
             nearest = np.argsort(np.abs(np.abs(values) - 1.0))
             angle = angle[nearest[angle[nearest] >= 0.0]][:_BESIDE_IT]
         else:
-            angle, values = self._resolved(self._answers(np.array([delay_s])))
+            [(angle, values)] = self._resolved(np.array([delay_s]))
             sizes = np.abs(values)
             least = np.concatenate([[0], local_maxima(-sizes), [sizes.size - 1]])
             angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
@@ -295,34 +315,42 @@ class _PredictedBlock:
 
     def _is_stable(self, delay_s: float) -> bool:
         """Whether the loop is stable at a true delay."""
-        small = self._states(delay_s) <= _LARGEST_CHECK
-        return radius_of(self._lifted(delay_s)) < 1.0 if small else self._turns(delay_s) == 0
+        if delay_s not in self.stable:
+            self._judge([delay_s])
+        return self.stable[delay_s]
 
-    def _turns(self, delay_s: float) -> int:
-        """How often det(I - N) goes around 0 as z goes around the unit circle, backwards."""
-        answers = self._answers(np.array([delay_s]))
-        angle, values = self._resolved(answers)
-        # from the last angle to pi the eigenvalues of I - N stay in the right half plane
-        last = self._differences(self._grid(angle[-1:]), answers)[0]
-        rest = np.angle(np.linalg.eigvals(last)).sum() if angle[-1] < pi else 0.0
-        return -round(float(np.angle(values[1:] / values[:-1]).sum() - rest) / pi)
+    def _judge(self, delays_s: list[float]) -> None:
+        large = [delay_s for delay_s in delays_s if self._states(delay_s) > _LARGEST_CHECK]
+        self.stable |= {delay_s: turns == 0 for delay_s, turns in zip(large, self._turns(large), strict=True)}
+        for delay_s in set(delays_s).difference(large):
+            self.stable[delay_s] = radius_of(self._lifted(delay_s)) < 1.0
 
-    def _resolved(self, answers: _Answers) -> tuple[FloatArray, ComplexArray]:
-        """Angles and det(I - N) at one true delay, which changes little from each angle to the next."""
-        angle, values = self.grid.angle, self._determinants(self.grid, answers)
+    def _turns(self, delays_s: list[float]) -> list[int]:
+        """How often det(I - N) goes around 0 as z goes around the unit circle, backwards, at each true delay."""
+        found = list[int]()
+        for delay_s, (angle, values) in zip(delays_s, self._resolved(np.array(delays_s)), strict=True):
+            # from the last angle to pi the eigenvalues of I - N stay in the right half plane
+            last = self._differences(self._grid(angle[-1:]), self._answers(np.array([delay_s])))[0]
+            rest = np.angle(np.linalg.eigvals(last)).sum() if angle[-1] < pi else 0.0
+            found.append(-round(float(np.angle(values[1:] / values[:-1]).sum() - rest) / pi))
+        return found
+
+    def _resolved(self, delays_s: FloatArray) -> list[tuple[FloatArray, ComplexArray]]:
+        """For each true delay, angles and det(I - N), which changes little from each angle to the next."""
+        answers = self._answers(delays_s)
+        each = [_Answers(*(part[[k]] for part in answers)) for k in range(delays_s.size)]
+        found = [(self.grid.angle, self._determinants(self.grid, own)) for own in each]
         for _ in range(_REFINEMENTS):
-            # slopes beside it count too: two zeros at one place turn the phase by a whole turn, which looks like none
-            width = np.diff(angle)
-            slope = np.pad(np.abs(np.log(values[1:] / values[:-1])) / width, 1)
-            coarse = np.flatnonzero(width * sliding_window_view(slope, 3).max(axis=1) > _MOST_TURN)
-            if coarse.size == 0:
+            between = [_between(*own) for own in found]
+            of = np.repeat(np.arange(delays_s.size), [own.size for own in between])
+            if of.size == 0:
                 break
-            shares = np.arange(1.0, _PARTS) / _PARTS
-            between = (angle[coarse, np.newaxis] + width[coarse, np.newaxis] * shares).ravel()
-            order = np.argsort(np.concatenate([angle, between]))
-            added = self._determinants(self._grid(between), answers)
-            angle, values = np.concatenate([angle, between])[order], np.concatenate([values, added])[order]
-        return angle, values
+            added = self._determinants(self._grid(np.concatenate(between)), _Answers(*(part[of] for part in answers)))
+            for k in np.unique(of).tolist():
+                angle = np.concatenate([found[k][0], between[k]])
+                order = np.argsort(angle)
+                found[k] = angle[order], np.concatenate([found[k][1], added[of == k]])[order]
+        return found
 
     def _states(self, delay_s: float) -> float:
         """Of the lifted map."""
@@ -407,3 +435,14 @@ class _PredictedBlock:
             if not np.any(step_s > _STILL * self.tick_s):
                 break
         return delay_s[step_s < _SOLVED * self.tick_s] - self.assumed_s
+
+
+def _between(angle: FloatArray, values: ComplexArray) -> FloatArray:
+    """Angles between neighbours at which values change too much."""
+    size, width = np.abs(values), np.diff(angle)
+    slope = np.abs(np.diff(values)) / (np.minimum(size[1:], size[:-1]) * width)
+    # slopes beside them count too: two zeros at one place turn the phase by a whole turn, which looks like none
+    steepest = np.maximum(slope, np.maximum(np.append(slope[1:], 0.0), np.append(0.0, slope[:-1])))
+    coarse = np.flatnonzero(width * steepest > _MOST_TURN)
+    shares = np.arange(1.0, _PARTS) / _PARTS
+    return (angle[coarse, np.newaxis] + width[coarse, np.newaxis] * shares).ravel()
