@@ -34,8 +34,9 @@ _LONGEST_HANKEL = 120
 FOLLOWER_MODES = 4
 """Two states and two late states: enough for a vehicle that does not react to those behind it."""
 _RANK_FLOOR = 1e-9
-_LEAST_SHARE = 0.1
-"""A mode counts if it carries this share of the motion; modes from rounding and clock noise carry less."""
+_LEAST_SHARE, _MISFITS = (0.03, 0.1), 10.0
+"""A mode counts if it carries more of the motion than so many misfits, but at least the first share and at most the
+second: modes from rounding and clock noise carry less."""
 CHANNELS = (
     "spacing_error_north_m",
     "spacing_error_east_m",
@@ -262,8 +263,10 @@ def _amplitudes(z: ComplexArray, values: FloatArray) -> tuple[ComplexArray, Comp
 def _slowest(z: ComplexArray, values: FloatArray) -> complex:
     """The mode of largest modulus among those that carry a share of the motion."""
     powers, amplitudes = _amplitudes(z, values)
-    carried = np.linalg.norm(powers, axis=0) * np.linalg.norm(amplitudes, axis=1) / np.linalg.norm(values)
-    counting = z[carried >= min(_LEAST_SHARE, float(carried.max()))]
+    size = np.linalg.norm(values)
+    carried = np.linalg.norm(powers, axis=0) * np.linalg.norm(amplitudes, axis=1) / size
+    misfit = float(np.linalg.norm(values - (powers @ amplitudes).real) / size)
+    counting = z[carried >= min(np.clip(_MISFITS * misfit, *_LEAST_SHARE), float(carried.max()))]
     return complex(counting[np.abs(counting).argmax()])
 
 
