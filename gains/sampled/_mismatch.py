@@ -195,6 +195,7 @@ class _PredictedBlock:
         return self._end_s(-1.0, below), self._end_s(1.0, above)
 
     def _looks(self, way: float) -> _Looks:
+        """Where the loop is judged below (-1) or above (1) the assumed delay, from the solutions found there."""
         ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
         ends_s = np.sort(ends_s[ends_s > _AT_ASSUMED * self.tick_s])
         known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
@@ -320,8 +321,10 @@ class _PredictedBlock:
         return self.stable[delay_s]
 
     def _judge(self, delays_s: list[float]) -> None:
+        """Remember whether the loop is stable at each true delay."""
         large = [delay_s for delay_s in delays_s if self._states(delay_s) > _LARGEST_CHECK]
-        self.stable |= {delay_s: turns == 0 for delay_s, turns in zip(large, self._turns(large), strict=True)}
+        if large:
+            self.stable |= {delay_s: turns == 0 for delay_s, turns in zip(large, self._turns(large), strict=True)}
         for delay_s in set(delays_s).difference(large):
             self.stable[delay_s] = radius_of(self._lifted(delay_s)) < 1.0
 
@@ -341,7 +344,7 @@ class _PredictedBlock:
         each = [_Answers(*(part[[k]] for part in answers)) for k in range(delays_s.size)]
         found = [(self.grid.angle, self._determinants(self.grid, own)) for own in each]
         for _ in range(_REFINEMENTS):
-            between = [_between(*own) for own in found]
+            between = [_refining(*own) for own in found]
             of = np.repeat(np.arange(delays_s.size), [own.size for own in between])
             if of.size == 0:
                 break
@@ -437,7 +440,7 @@ class _PredictedBlock:
         return delay_s[step_s < _SOLVED * self.tick_s] - self.assumed_s
 
 
-def _between(angle: FloatArray, values: ComplexArray) -> FloatArray:
+def _refining(angle: FloatArray, values: ComplexArray) -> FloatArray:
     """Angles between neighbours at which values change too much."""
     size, width = np.abs(values), np.diff(angle)
     slope = np.abs(np.diff(values)) / (np.minimum(size[1:], size[:-1]) * width)

@@ -19,7 +19,7 @@ from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
 
-if TYPE_CHECKING:  # the schema of scenarios takes as long as the rest of the answer
+if TYPE_CHECKING:  # it imports the schema of scenarios, which a JSON model does not need
     from gcs.plan.design import PredictionPart
 
 _ROWS = 20
