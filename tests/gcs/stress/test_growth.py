@@ -41,6 +41,15 @@ def test_the_slower_mode_is_reported_though_it_starts_smaller() -> None:
     assert found.growth_1_s == pytest.approx(-0.3, abs=1e-6)
 
 
+def test_the_slowest_mode_counts_where_it_stands_out_from_noise() -> None:
+    """As of a predicted loop near 0.72 s: it carries less than a tenth of the motion, and many times the noise."""
+    slowest, other = (-0.362 + 9.8j, 0.065), (-0.455 + 2.24j, 0.72)
+    for noise, (mode, _), allowed in ((1e-4, slowest, 1e-3), (0.03, other, 0.03)):  # the rates are 0.09 1/s apart
+        found = fit_growth(motion(slowest, other, noise=noise), start_s=0.0, end_s=9.5)
+        assert found is not None
+        assert found.growth_1_s == pytest.approx(mode.real, abs=allowed)
+
+
 def test_a_real_mode_is_found_beside_an_oscillation() -> None:
     found = fit_growth(motion((-0.2, 2.0), (-0.9 + 3j, 2.0)), start_s=0.0)
     assert found is not None
