@@ -29,8 +29,9 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
+from gains.sampled._continuous_mismatch import continuous_crossings
 from gains.sampled._loop import HeldPlant, held_blocks, rate_of
-from gains.sampled._mismatch import block_window, continuous_crossings
+from gains.sampled._mismatch import block_window
 from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
 
@@ -47,9 +48,9 @@ def mismatch_window(
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     0 if it is stable down to no delay, `inf` if no longer delay is found to be too long, and `assumed_s` twice if it is
-    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, confirmed on either side by
-    the spectrum of the lifted map, or by Nyquist's criterion if that is large. Between them the window is a search, not
-    a proof: see `gains.sampled._mismatch`.
+    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s. Each is confirmed within by
+    the spectrum of the lifted map, or by Nyquist's criterion if that is large, and beyond by the faster of the two.
+    Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay over which is predicted.

@@ -1,0 +1,180 @@
+"""I - N of one block of a predicted loop, at one rate or with telemetry at another rate than control.
+
+Let X_i be the predicted state at the instant at which command i is assumed to act: X_{i+1} = Phi X_i + G u_i. At the
+sample j the measured state differs from the predicted one by w_j, and a command k computed from it is
+
+    u_k = K X_k + K L_k w_j,   L_k = `HeldPlant.carry` from that sample to the instant at which the command acts.
+
+Both states answer to the same commands, one after the true delay and one after the assumed delay, so each is that of X
+an instant earlier: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r by the true delay, minus the same by the assumed one.
+Of w_j only v_j matters: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u
+depends on v by a transfer function that is stable if the loop without delay is stable, and v depends on u. Together
+v = N(z) v, with N = 0 where there is no mismatch. So where an eigenvalue is on the unit circle, det(I - N) = 0 there,
+and the loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
+"""
+
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
+from gains.sampled._loop import HeldPlant
+from gains.sampled.multirate import Timing
+
+# rad by which a delayed term turns between neighbouring angles, the longest true delay (in assumed ones) for which it
+# does, and the least number of angles
+_TURN, _LONGEST, _ANGLES = 0.25, 1.5, 200
+# angles added to even ones: shares of the highest
+_LOW = np.logspace(-5.0, 0.0, 80)
+# no angle is needed where the norm of N stays below this
+_SMALL = 0.95
+# largest relative change of det(I - N) between neighbouring angles, into how many parts they are divided for that, how
+# often, and the modulus of a zero
+_MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
+
+
+class Grid(NamedTuple):
+    """Angles (k,) of z, X_0 (k, n, m) as a function of v, and what the samples see of it by the assumed delay."""
+
+    angle: FloatArray
+    first: ComplexArray
+    assumed: ComplexArray
+
+
+class Answers(NamedTuple):
+    """What the samples see of X_0 and v: exponents of z (k, m), maps (k, m, n) and (k, m, m)."""
+
+    exponents: FloatArray
+    of_first: FloatArray
+    of_v: FloatArray
+
+    def of(self, delays: IntArray) -> "Answers":
+        """Those to some of the true delays."""
+        return Answers(*(part[delays] for part in self))
+
+    def each(self) -> list["Answers"]:
+        """Those to each true delay alone."""
+        return [self.of(np.array([k])) for k in range(len(self.of_v))]
+
+
+class PredictedDifference:
+    """I - N of one block at any z on the unit circle and any true delay."""
+
+    def __init__(self, plant: HeldPlant, timing: Timing, assumed_s: float) -> None:
+        self.plant, self.timing, self.assumed_s = plant, timing, assumed_s
+        self.ticks, self.common_s, self.spread_s = timing.ticks, timing.common_s, timing.spread_s
+        self.tick_s = self.common_s / self.ticks
+        K, n = plant.K, len(plant.A)
+        Phi, G = (maps[0] for maps in plant.transition(np.array([self.tick_s])))
+        self.closed = Phi + G @ K
+        commands = timing.commands_from(0, self.ticks - 1, every_tick=True)
+        taken_s = np.array([sampled_s for sampled_s, _ in commands])
+        self.samples_s, of_sample = np.unique(taken_s, return_inverse=True)
+        late_s = np.array([computed_s for _, computed_s in commands]) + max(0.0, assumed_s - self.spread_s) - taken_s
+        seen = np.eye(n) if plant.measured is None else np.diag(plant.measured.astype(np.float64))[plant.measured]
+        carried = K @ plant.carry(late_s) @ seen.T
+        # rows of v: what they see of w, and of which sample; and what v adds to each command
+        counted, onto = list[FloatArray](), list[FloatArray]()
+        for sample in range(self.samples_s.size):
+            every = np.vstack(list(carried[of_sample == sample]))
+            few = len(every) < len(seen)
+            counted.append(every @ seen if few else seen)
+            onto += np.split(np.eye(len(every)) if few else every, np.count_nonzero(of_sample == sample))
+        self.counted = np.vstack(counted)
+        self.sample = np.repeat(np.arange(self.samples_s.size), [len(rows) for rows in counted])
+        self.on_v = np.zeros((self.ticks, len(K), len(self.sample)))
+        for k, own in enumerate(onto):
+            self.on_v[k][:, self.sample == of_sample[k]] = own
+        # X_k = closed^k X_0 + added_k
+        powers, added = [np.eye(n)], [np.zeros((n, len(self.sample)))]
+        for on_v in self.on_v:
+            powers.append(self.closed @ powers[-1])
+            added.append(self.closed @ added[-1] + G @ on_v)
+        self.powers, self.added = np.array(powers), np.array(added)
+        self.by_assumed = self.answers(np.array([assumed_s]))
+        self.grid = self.at(self._angles())
+
+    def _angles(self) -> FloatArray:
+        """Angles from 0 to pi, or to where the norm of N stays below one at every true delay."""
+        coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), pi * _LOW)
+        delays_s = self.spread_s + np.linspace(0.0, self.common_s, max(self.ticks, 8) + 1)
+        _, onto_first, onto_v = self.answers(delays_s)
+        of_first, of_v = (np.linalg.norm(onto, axis=(1, 2)).max() for onto in (onto_first, onto_v))
+        bound = 2.0 * (of_first * np.linalg.norm(self._first(coarse), axis=(1, 2)) + of_v)
+        last = coarse[min(np.flatnonzero(bound > _SMALL).max(initial=0) + 1, coarse.size - 1)]
+        turns = last * (_LONGEST * self.assumed_s / self.common_s + 1.0) / _TURN
+        return np.union1d(np.linspace(0.0, last, max(int(turns), _ANGLES)), last * _LOW)
+
+    def _first(self, angle: FloatArray) -> ComplexArray:
+        free = np.exp(1j * angle)[:, np.newaxis, np.newaxis] * np.eye(len(self.closed)) - self.powers[-1]
+        return np.linalg.solve(free, self.added[-1]).astype(np.complex128)
+
+    def at(self, angle: FloatArray) -> Grid:
+        """What does not depend on the true delay, at k angles."""
+        grid = Grid(angle, self._first(angle), np.zeros(1, np.complex128))
+        return grid._replace(assumed=self.seen_at(grid, self.by_assumed))
+
+    def answers(self, delays_s: FloatArray) -> Answers:
+        """What the samples see with k true delays."""
+        until_s = self.samples_s - np.maximum(0.0, delays_s - self.spread_s)[:, np.newaxis]
+        behind = np.floor(until_s / self.tick_s + 1e-11)
+        rest_s = np.maximum(0.0, until_s - behind * self.tick_s)
+        flow, hold = (maps.reshape(*rest_s.shape, *maps.shape[1:]) for maps in self.plant.transition(rest_s.ravel()))
+        periods, k = np.divmod(behind.astype(np.int64), self.ticks)
+        flow = flow + hold @ self.plant.K
+        seen = self.counted[:, np.newaxis]
+        of_first = seen @ (flow @ self.powers[k])[:, self.sample]
+        of_v = seen @ (flow @ self.added[k] + hold @ self.on_v[k])[:, self.sample]
+        return Answers(periods[:, self.sample].astype(np.float64), of_first[:, :, 0], of_v[:, :, 0])
+
+    def seen_at(self, grid: Grid, answers: Answers) -> ComplexArray:
+        """What the samples see of v through the commands, (k, m, m), with one true delay or k of them."""
+        turned = np.exp(1j * grid.angle[:, np.newaxis] * answers.exponents)[:, :, np.newaxis]
+        return turned * (answers.of_first.astype(np.complex128) @ grid.first + answers.of_v)
+
+    def differences(self, grid: Grid, answers: Answers) -> ComplexArray:
+        """I - N (k, m, m), with one true delay or k of them."""
+        return np.eye(len(self.sample)) + grid.assumed - self.seen_at(grid, answers)
+
+    def determinants(self, grid: Grid, answers: Answers) -> ComplexArray:
+        """det(I - N) (k,), none of them zero."""
+        values = np.linalg.det(self.differences(grid, answers)).astype(np.complex128)
+        return np.where(values == 0.0, _LEAST, values)
+
+    def turns(self, delays_s: list[float]) -> list[int]:
+        """How often det(I - N) goes around 0 as z goes around the unit circle, backwards, at each true delay."""
+        found = list[int]()
+        for delay_s, (angle, values) in zip(delays_s, self.resolved(np.array(delays_s)), strict=True):
+            # from the last angle to pi the eigenvalues of I - N stay in the right half plane
+            last = self.differences(self.at(angle[-1:]), self.answers(np.array([delay_s])))[0]
+            rest = np.angle(np.linalg.eigvals(last)).sum() if angle[-1] < pi else 0.0
+            found.append(-round(float(np.angle(values[1:] / values[:-1]).sum() - rest) / pi))
+        return found
+
+    def resolved(self, delays_s: FloatArray) -> list[tuple[FloatArray, ComplexArray]]:
+        """For each true delay, angles and det(I - N), which changes little from each angle to the next."""
+        answers = self.answers(delays_s)
+        found = [(self.grid.angle, self.determinants(self.grid, own)) for own in answers.each()]
+        for _ in range(_REFINEMENTS):
+            between = [_refining(*own) for own in found]
+            of = np.repeat(np.arange(delays_s.size), [own.size for own in between])
+            if of.size == 0:
+                break
+            added = self.determinants(self.at(np.concatenate(between)), answers.of(of))
+            for k in np.unique(of).tolist():
+                angle = np.concatenate([found[k][0], between[k]])
+                order = np.argsort(angle)
+                found[k] = angle[order], np.concatenate([found[k][1], added[of == k]])[order]
+        return found
+
+
+def _refining(angle: FloatArray, values: ComplexArray) -> FloatArray:
+    """Angles between neighbours at which values change too much."""
+    size, width = np.abs(values), np.diff(angle)
+    slope = np.abs(np.diff(values)) / (np.minimum(size[1:], size[:-1]) * width)
+    # slopes beside them count too: two zeros at one place turn the phase by a whole turn, which looks like none
+    steepest = np.maximum(slope, np.maximum(np.append(slope[1:], 0.0), np.append(0.0, slope[:-1])))
+    coarse = np.flatnonzero(width * steepest > _MOST_TURN)
+    shares = np.arange(1.0, _PARTS) / _PARTS
+    return (angle[coarse, np.newaxis] + width[coarse, np.newaxis] * shares).ravel()
