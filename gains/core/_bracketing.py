@@ -16,6 +16,8 @@ _EPS = float(np.finfo(np.float64).eps)
 _GOLDEN = (3.0 - 5.0**0.5) / 2.0
 # 60 steps shrink a bracket to 1e-13: enough for a kink; a smooth peak is known to 1e-8 only
 _GOLDEN_STEPS = 60
+# closer looks at a peak: how many at most, and where, as shares of the last one
+_LOOKS, _SHARES = 14, np.linspace(0.0, 1.0, 17)
 # a peak exceeds its highest sample by less than this many times the difference of neighbouring samples
 _REACH = 4.0
 # most steps of false position, reached where the function is too rough for the resolution
@@ -42,14 +44,23 @@ def local_maxima(values: FloatArray) -> IntArray:
 
 
 def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
-    """Place and height of the largest value on a rising grid, with every local maximum refined."""
+    """Place and height of the largest value on a rising grid, with those local maxima refined that may exceed it."""
     values = function(grid)
-    inner = local_maxima(values)
-    if inner.size:
-        places = peaks(function, grid[inner - 1], grid[inner + 1])
-        grid, values = np.concatenate([grid, places]), np.concatenate([values, function(places)])
-    at = int(np.argmax(values))
-    return float(grid[at]), float(values[at])
+    best = int(np.argmax(values))
+    place, height = float(grid[best]), float(values[best])
+    inner = np.flatnonzero(may_reach_zero(grid, (values - height)[:, np.newaxis])) + 1
+    low, high, row = grid[inner - 1], grid[inner + 1], np.arange(inner.size)
+    for _ in range(_LOOKS if inner.size else 0):
+        points = low[:, np.newaxis] + (high - low)[:, np.newaxis] * _SHARES
+        values = function(points.ravel()).reshape(points.shape)
+        at = np.clip(values.argmax(axis=1), 1, _SHARES.size - 2)
+        low, high, top = points[row, at - 1], points[row, at + 1], values[row, at]
+        if top.max() > height:
+            best = int(top.argmax())
+            place, height = float(points[best, at[best]]), float(top[best])
+        if (2.0 * top - values[row, at - 1] - values[row, at + 1]).max() <= _EPS * abs(height):
+            break
+    return place, height
 
 
 def may_reach_zero(points: FloatArray, values: FloatArray) -> BoolArray:

@@ -4,12 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gains.core._bracketing import local_maxima
+from gains.core._bracketing import highest
+from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.sampled._loop import HeldPlant, lifted_map, settled_covariance
-
-# Closer looks at every peak of a response, each at this many frequencies between the neighbours of its highest one.
-_LOOKS, _CLOSER = 6, 9
 
 
 def peak_gain(
@@ -36,20 +34,9 @@ def peak_gain(
 
     def gain(omega: FloatArray) -> FloatArray:
         response = C @ np.linalg.solve(characteristic(omega), B.astype(np.complex128)) + through
-        return np.linalg.norm(response, ord=2, axis=(1, 2)).astype(np.float64)
+        return spectral_norms(response)
 
-    values = gain(frequencies)
-    inner = local_maxima(values)
-    # a peak below half of the highest sample cannot become the highest on a grid that shows every peak
-    tall = inner[values[inner] >= 0.5 * values.max()]
-    low, high, largest = frequencies[tall - 1], frequencies[tall + 1], float(values.max())
-    for _ in range(_LOOKS if tall.size else 0):
-        omega = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _CLOSER)
-        closer = gain(omega.ravel()).reshape(omega.shape)
-        at = np.clip(np.argmax(closer, axis=1), 1, _CLOSER - 2)[:, None]
-        low, high = (np.take_along_axis(omega, at + step, 1)[:, 0] for step in (-1, 1))
-        largest = max(largest, float(closer.max()))
-    return largest
+    return highest(gain, frequencies)[1]
 
 
 def noise_gain(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, delay_s: float) -> float:

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import highest
+from gains.core._norms import spectral_norms
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.criteria.figures import LoopFigures
@@ -236,7 +237,7 @@ class PredictedFigures:
                 seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
                 commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
                 moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
-                return np.linalg.norm(out @ moved, ord=2, axis=(1, 2))
+                return spectral_norms(out @ moved)
 
             return gain
 

@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gains.core._bracketing import highest, met_end
+from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
@@ -106,8 +107,7 @@ class FlownFormation:
 
     def frequencies(self) -> FloatArray:
         """Frequencies (rad/s) that show every valley of σ_min. Beyond the last one σ_min is larger than at rest."""
-        A, own, others = self._matrices
-        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(own, 2) + np.linalg.norm(others, 2))
+        highest = 4.0 * float(spectral_norms(np.stack(self._matrices)).sum())
         return np.concatenate([[0.0], np.geomspace(self._slowest * 1e-2, highest, _FREQUENCIES)])
 
     def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:

@@ -24,6 +24,7 @@ from math import inf, pi, tau
 import numpy as np
 
 from gains.core._bracketing import highest, peaks
+from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.performance.disturbed import DisturbedFormation
@@ -82,7 +83,7 @@ class SectorLoop:
         """The least size of a disturbance that may be any stable filter."""
 
         def largest(omega: FloatArray) -> FloatArray:
-            return np.linalg.norm(self.response(omega), ord=2, axis=(1, 2)).astype(np.float64)
+            return spectral_norms(self.response(omega))
 
         omega, peak = self._peak(largest, np.zeros(0), np.zeros(0))
         if peak <= 0.0:
@@ -93,11 +94,11 @@ class SectorLoop:
     def real_radius(self) -> Worst:
         """The least size of a constant disturbance, the same on each axis."""
         ends = np.array([0.0, pi / self.formation.period_s])
-        at_ends = np.linalg.norm(self.response(ends).real, ord=2, axis=(1, 2))
+        at_ends = spectral_norms(self.response(ends).real)
 
         def largest(omega: FloatArray) -> FloatArray:
             M = self.response(omega)
-            values = np.linalg.norm(M, ord=2, axis=(1, 2)).astype(np.float64)  # μ_R is no larger
+            values = spectral_norms(M)  # μ_R is no larger
             if (likely := values > at_ends.max()).any():
                 values[likely] = _real_measure(M[likely])[0]
             return values

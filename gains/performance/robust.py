@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._norms import spectral_norms
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix
@@ -92,7 +93,7 @@ def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
     gamma = 0.0
     for _ in range(_LEVEL_ROUNDS):
         response = W @ np.linalg.inv(1j * frequencies[:, None, None] * identity - A)
-        peak = float(np.linalg.norm(response, ord=2, axis=(1, 2)).max())
+        peak = float(spectral_norms(response).max())
         if peak <= gamma:
             break
         gamma = peak * (1 + _LEVEL_STEP)

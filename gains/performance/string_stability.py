@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import highest
+from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 
@@ -63,7 +64,7 @@ def string_peak(
             entry = entry + s**2 * feed_forward * identity
         if len(identity) == 1:
             return (entry / loop)[:, 0, 0]
-        return np.linalg.norm(np.linalg.solve(loop, entry), ord=2, axis=(1, 2))
+        return spectral_norms(np.linalg.solve(loop, entry))
 
     near = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
     return max(1.0, largest_magnitude(growth, near_rad_s=near or 1.0))

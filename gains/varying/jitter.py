@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._norms import spectral_norms
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
@@ -150,7 +151,7 @@ def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled:
     count = _FREQUENCIES_GAIN if scaled else _FREQUENCIES_ROUGH
     fine = np.concatenate([highest * np.logspace(-4.0, 3.0, count), np.linspace(0.0, highest, count)])
     loops = np.concatenate([_loop_gains(now, late, B, C, mean_s, fine), (C @ B)[np.newaxis]])
-    largest = float(np.linalg.norm(D @ loops @ np.linalg.inv(D), ord=2, axis=(1, 2)).max())
+    largest = float(spectral_norms(D @ loops @ np.linalg.inv(D)).max())
     return 1.0 / (largest * (1.0 + _GRID_ERROR))
 
 
@@ -169,7 +170,7 @@ def _scaling(loops: ComplexArray) -> FloatArray:
     real = np.concatenate(
         [np.concatenate([loops.real, -loops.imag], axis=2), np.concatenate([loops.imag, loops.real], axis=2)], axis=1
     )
-    upper = float(np.linalg.norm(loops, ord=2, axis=(1, 2)).max())
+    upper = float(spectral_norms(loops).max())
     lower = float(np.abs(np.linalg.eigvals(loops)).max())
     best = np.eye(r)
     for _ in range(_HALVINGS):

@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import highest
+from gains.core._norms import spectral_norms
 from gains.core.arrays import BoolArray, ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
@@ -146,7 +147,7 @@ class _Response:
         while not found or onto.any():
 
             def gain(angle: FloatArray, onto: FloatArray = onto) -> FloatArray:
-                return np.linalg.norm(_rows(plant, angle, assumed_s, mean_s) @ onto, ord=2, axis=(1, 2))
+                return spectral_norms(_rows(plant, angle, assumed_s, mean_s) @ onto)
 
             found.append(highest(gain, grid)[1])
             onto = A_seen @ onto
@@ -174,7 +175,7 @@ def _integral(A: FloatArray, B: FloatArray, computed: BoolArray) -> float:
         return 0.0
     settled_s = _SETTLED / float(-np.linalg.eigvals(own).real.max())
     at_s = np.linspace(0.0, settled_s, _INSTANTS)
-    sizes = np.linalg.norm(matrix_exponentials(at_s[:, np.newaxis, np.newaxis] * own) @ entry, ord=2, axis=(1, 2))
+    sizes = spectral_norms(matrix_exponentials(at_s[:, np.newaxis, np.newaxis] * own) @ entry)
     return float(np.trapezoid(sizes, at_s))
 
 

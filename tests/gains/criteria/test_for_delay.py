@@ -68,7 +68,7 @@ ASKED: list[tuple[float | None, dict[str, Any]]] = [
     ("method", "margin_s", "criteria"),
     [
         *(("inclusion", *asked) for asked in ASKED),
-        *(pytest.param("graph-lqr", *asked, marks=LONG if k in (1, 3, 4) else ()) for k, asked in enumerate(ASKED)),
+        *(pytest.param("graph-lqr", *asked, marks=LONG if 0 < k < 5 else ()) for k, asked in enumerate(ASKED)),
     ],
 )
 def test_a_criterion_is_met(method: str, margin_s: float | None, criteria: dict[str, Any]) -> None:
@@ -99,20 +99,20 @@ BOTH = WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5}
     ("method", "criteria", "named"),
     [
         ("inclusion", AT_DELAY, {"alpha_at_delay", "decay_rate_at_delay_1_s"}),
-        ("inclusion", WEIGHTED, {"alpha_at_delay"}),
+        pytest.param("inclusion", WEIGHTED, {"alpha_at_delay"}, marks=LONG),
         (
             "inclusion",
             {"at_delay_s": 0.3, "discrete": True, "decay_rate_at_delay_1_s": 2.5},
             {"decay_rate_at_delay_1_s"},
         ),
-        ("inclusion", REGION, set(REGION)),
+        pytest.param("inclusion", REGION, set(REGION), marks=LONG),
         (
             "inclusion",
             {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0},
             {"spacing_gain_max_s2", "noise_gain_max"},
         ),
         # neither is reached however far the other one is relaxed
-        ("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
+        pytest.param("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}, marks=LONG),
         ("graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}),
         pytest.param("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}, marks=LONG),
         pytest.param(
