@@ -35,10 +35,9 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "quick": (figures.design, figures.margin_held, figures.margin_thesis, figures.readme_onset),
     "exact": (
         *(figures.onset_chain3, figures.string_limit, figures.compare, figures.prediction_windows),
-        *(figures.prediction_price, figures.prediction_flights, figures.onsets, figures.thesis_flights),
-        *(figures.maps, figures.capacity),
+        *(figures.prediction_price, figures.prediction_flights, figures.thesis_flights),
     ),
-    "slow": (figures.copters_onset,),
+    "slow": (figures.onsets, figures.maps, figures.capacity, figures.copters_onset),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
         *(figures.signing, figures.design_time, figures.speed, figures.onset_real_time, tick_ratio, peers, cluster),

@@ -6,6 +6,7 @@ thesis, NIT Rourkela, 2012. Each number that contradicts it is found by two inde
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import compress, islice, product
 from pathlib import Path
 
@@ -369,6 +370,7 @@ def _late_entries() -> list[tuple[FloatArray, FloatArray]]:
     return [loop for _, loop in late_choices(SINGLE, K, entries)]
 
 
+@cache
 def subset_margins() -> FloatArray:
     """The delay margin for each choice of which of the twelve printed scalar gains are late."""
     margins: list[float] = []

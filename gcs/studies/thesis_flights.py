@@ -69,6 +69,7 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
     return float(slope), settled_s
 
 
+@cache
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
     """Fly one of the triangle scenarios without link delay; returns its ticks and settling time."""
     designed, plan = _planned(name, method)
@@ -84,6 +85,7 @@ def disturbance_onset() -> tuple[float, DisturbanceOnset]:
     return found.loop_delay_s, found.onsets[0]
 
 
+@cache
 def _planned(name: str, method: str) -> tuple[Design, FlightPlan]:
     """The plan of a scenario without link delay, with gains of inclusion at α = 0.93, or of a graph method at the same
     delay margin."""

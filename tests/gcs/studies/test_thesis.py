@@ -19,6 +19,8 @@ from gcs.studies.thesis import late_neighbours
 from gcs.studies.thesis_flights import CHAIN, nonlinear_response, printed_gains
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.xdist_group("thesis")  # they share flights and margins
+
 
 def test_printed_gains_tolerate_a_second_not_the_published_0_19() -> None:
     # both numbers by sweep and spectrum in the project's restatement of the source
