@@ -27,8 +27,11 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
         yield "control.criteria", "requirements", "either criteria, or gains or blocks"
     if control.loop == "onboard":
         yield "control.loop", control.loop, "ground, with control.criteria"
-    if scenario.dynamics != "double_integrator" or control.prediction != "off":
-        yield "control.criteria", "requirements", "no such key with dynamics autopilot or prediction"
+    if scenario.dynamics != "double_integrator":
+        wanted = f"no such key with dynamics {scenario.dynamics}: it is for vehicles that respond at once"
+        yield "control.criteria", "requirements", wanted
+    if control.prediction != "off":
+        yield "control.criteria", "requirements", "no such key with prediction"
     low, high = criteria.delays_s or (0.0, 0.0)
     if low > high:
         yield "control.criteria.delays_s", [low, high], "the smaller delay first"
@@ -52,8 +55,11 @@ def _for_link_contradictions(scenario: Scenario) -> Iterator[Fault]:
         yield key, control.for_link, "off, with gains, blocks, alpha, delay_margin_s or decay_rate_1_s"
     if control.method != "inclusion" or control.loop != "ground":
         yield key, control.for_link, "off, unless method is inclusion and loop is ground"
-    if control.prediction != "off" or scenario.dynamics == "autopilot":
-        yield key, control.for_link, "off, with prediction or dynamics autopilot"
+    if control.prediction != "off":
+        yield key, control.for_link, "off, with prediction: it is chosen together with the gains"
+    if scenario.dynamics == "autopilot" or scenario.response is not None:
+        whose = "dynamics autopilot" if scenario.dynamics == "autopilot" else "a [response]"
+        yield key, control.for_link, f"off, with {whose}: gains for a link are those of vehicles that respond at once"
     if control.criteria is None:
         return
     for name in _MEASURED:

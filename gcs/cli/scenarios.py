@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gcs.drive.check import CourseCheck, PlannedMotionCheck, ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
 
-MOST_VEHICLES = 254
+MOST_VEHICLES = 250
 
 
 def scenarios(

@@ -16,6 +16,7 @@ from gains.sampled.constant import growth_rate
 from gains.sampled.onboard import onboard_loop
 from gcs.link.clocks import REQUEST_LIFETIME_NS
 from gcs.plan.course import nearest_planned
+from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
 from scenarios.schema import NS_PER_S, Scenario
@@ -78,7 +79,8 @@ def _matrices(plan: FlightPlan) -> tuple[FloatArray, FloatArray, FloatArray]:
 def bad_start(scenario: Scenario) -> str | None:
     """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit.
 
-    Also formation changes that would lead to a collision: the least distance between places, over the whole flight.
+    Also a speed that simulated vehicles with an autopilot cannot fly.
+    Also places that are too close to each other, over the whole flight.
     """
     safety, vehicles, offset_ne_m = scenario.safety, scenario.leader_first(), plan_formation(scenario).offset_ne_m
     for one, two in combinations(vehicles, 2):
@@ -88,6 +90,11 @@ def bad_start(scenario: Scenario) -> str | None:
             read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
             wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
             return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
+    speeds_m_s = [hypot(*entry.velocity_ne_m_s) for entry in scenario.nominal_velocity]
+    fastest_m_s = max([*speeds_m_s, scenario.course.speed_m_s or 0.0])
+    if scenario.dynamics == "autopilot" and fastest_m_s > scenario.autopilot.speed_max_m_s:
+        wanted = f"at most autopilot.speed_max_m_s = {scenario.autopilot.speed_max_m_s:g} m/s"
+        return f"nominal_velocity: read {fastest_m_s:g} m/s, wanted {wanted}"
     place = {vehicle.system_id: vehicle.position_ne_m for vehicle in vehicles}
     for vehicle, offset in zip(vehicles, offset_ne_m.tolist(), strict=True):
         if vehicle.follows is None:
@@ -99,27 +106,30 @@ def bad_start(scenario: Scenario) -> str | None:
             read = f"vehicle {vehicle.system_id} with a spacing error of {error_m:g} m"
             wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"
             return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
-    return _collision_on_the_way(scenario) if scenario.formation_changes else None
+    return _close_places(scenario)
 
 
-def _collision_on_the_way(scenario: Scenario) -> str | None:
-    """A collision of the places of two vehicles during or after a formation change."""
+def _close_places(scenario: Scenario) -> str | None:
+    """Places of two vehicles that are too close to each other, in the formation or during a change of it."""
     nearest, least_m = nearest_planned(scenario), scenario.safety.collision_distance_m
     if nearest is None or nearest.distance_m >= least_m:
         return None
     one, two = nearest.system_ids
     read = f"places of vehicles {one} and {two} {nearest.distance_m:.2f} m apart at {nearest.time_s:.1f} s"
-    return f"formation_changes: read {read}, wanted at least safety.collision_distance_m = {least_m:g} m"
+    key = "formation_changes" if scenario.formation_changes else "vehicles.offset_ne_m"
+    return f"{key}: read {read}, wanted at least safety.collision_distance_m = {least_m:g} m"
 
 
 def endless_link(scenario: Scenario) -> str | None:
-    """A link too slow for the flight to begin, or for any command to be computed from a state of that flight.
+    """A link that loses everything, or is too slow for the flight to begin, or for any command from one of its states.
 
     A TIMESYNC reply that arrives after its request has expired is ignored, so no clock would ever be known.
     """
     lifetime_s = REQUEST_LIFETIME_NS / NS_PER_S
     for vehicle in scenario.leader_first():
         links = scenario.link_of(vehicle.system_id)
+        if any(link.loss_probability >= 1.0 for link in links):
+            return f"links: read loss_probability 1 to vehicle {vehicle.system_id}, wanted less than 1"
         first_s = sum(link.delay_points[0].delay_s if link.delay_points else link.delay_s for link in links)
         least_s = sum(min((point.delay_s for point in link.delay_points), default=link.delay_s) for link in links)
         read = f"links: read a round trip of {{:g}} s to vehicle {vehicle.system_id}, wanted less than"
@@ -127,4 +137,9 @@ def endless_link(scenario: Scenario) -> str | None:
             return f"{read.format(first_s)} the {lifetime_s:g} s that the station waits for an answer"
         if least_s >= scenario.duration_s:
             return f"{read.format(least_s)} duration_s = {scenario.duration_s:g} s"
+    links = [link for vehicle in scenario.vehicles for link in scenario.link_of(vehicle.system_id)]
+    jitters = any(link.jitter for link in links) and not any(link.delay_points for link in links)
+    if jitters and (usual_s := expected_loop_delay_s(scenario)) >= lifetime_s:
+        wanted = f"less than the {lifetime_s:g} s that the station waits for an answer"
+        return f"links: read delays and jitter that make a loop delay of {usual_s:.3g} s, wanted {wanted}"
     return None

@@ -103,6 +103,8 @@ class RemoteVehicle:
         self._report = report
         self._sequence = 0
         self._command: _Waiting | None = None
+        self._earlier = 0, 0
+        """A command that was sent more than once, and how many answers to its copies may still come."""
         self._not_before_ns = 0
         self._reported_orders = {NEW}
         self._outdated: list[tuple[int, int, bool]] = []
@@ -259,7 +261,12 @@ class RemoteVehicle:
         if result == _IN_PROGRESS:
             waiting.sent_ns = now_ns
             return
+        earlier, answers = self._earlier
+        if earlier == command and answers > 0:  # says nothing of this request
+            self._earlier = earlier, answers - 1
+            return
         self._command = None
+        self._earlier = command, waiting.confirmation
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
             if command == SET_MESSAGE_INTERVAL and waiting.parameters[0] == OPTIONAL:
@@ -284,7 +291,8 @@ class RemoteVehicle:
         """The frame that is due to bring the vehicle to the wanted state, if any: a command, else a parameter.
 
         One command at a time awaits its ACK, which carries no request id. Without an answer for three round trips, and
-        1 s at least, the command is sent again with its confirmation raised.
+        1 s at least, the command is sent again with its confirmation raised. Then there may be several answers: the
+        later ones do not count for the next request with the same command.
         """
         self._now_ns = now_ns
         if self.address is None:
@@ -304,6 +312,7 @@ class RemoteVehicle:
                 return None
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
+            self._earlier = 0, 0  # an answer to an earlier request would have come
             revocable = waiting.command == SET_MODE or self.startup.has_landed
             if revocable and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None

@@ -119,6 +119,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
     slowest_s = max(delays_s.values(), default=None)
+    longest_flown = int(np.bincount(sent["gain_set"], minlength=1).argmax())
     return Summary(
         scenario=scenario.name,
         verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
@@ -132,7 +133,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         response=design.response,
         loop_delay_s=_spread(sent["loop_delay_s"]),
         loop_delay_bound_s=np.fmax.reduce(sent["loop_delay_bound_s"], initial=np.nan),
-        at_loop_delay=figures_at(design, scenario, slowest_s),
+        at_loop_delay=figures_at(design, scenario, slowest_s, longest_flown),
         spread=_flown_spread(scenario, design, flown, delays_s),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
         headroom_end=headroom_end,

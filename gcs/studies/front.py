@@ -101,10 +101,14 @@ def product_of(methods: Sequence[Method], predicted: Sequence[bool], aims: Seque
 
 def searched_in(scenario: Scenario) -> FrontSearch:
     """The search of a scenario's formation. Raises InputError where a front is not defined."""
-    if scenario.dynamics == "autopilot" or scenario.control.loop == "onboard":
-        raise InputError(
-            f"{scenario.name}: read dynamics autopilot or loop onboard, wanted neither with --front or --at"
-        )
+    for read, given in (
+        ("dynamics autopilot", scenario.dynamics == "autopilot"),
+        ("a [response]", scenario.response is not None),
+        ("loop onboard", scenario.control.loop == "onboard"),
+    ):
+        if given:
+            wanted = "vehicles that respond at once and loop ground, with --front or --at"
+            raise InputError(f"{scenario.name}: read {read}, wanted {wanted}")
     if len(scenario.vehicles) > MOST_VEHICLES:
         wanted = f"at most {MOST_VEHICLES} with --front or --at; gains by inclusion are those of a smaller formation"
         raise InputError(f"{scenario.name}: read {len(scenario.vehicles)} vehicles, wanted {wanted}")

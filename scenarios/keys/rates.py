@@ -15,7 +15,8 @@ class Rates(Part):
     telemetry_hz: Rate = 50.0
     """LOCAL_POSITION_NED messages from each vehicle."""
     timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
-    """TIMESYNC exchanges with each vehicle. At most `control_hz`, because each control tick logs one round trip."""
+    """TIMESYNC exchanges with each vehicle. More than `control_hz` counts as `control_hz`, because each control
+    tick logs one round trip."""
     target_hz: Annotated[float, Field(ge=0, le=500)] = 10.0
     """POSITION_TARGET_LOCAL_NED messages from each vehicle, which show what acted; with `control.prediction` only, and
     never more than `telemetry_hz`. 0: none, and every set-point is assumed to act as it was sent."""

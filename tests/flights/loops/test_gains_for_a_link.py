@@ -15,15 +15,16 @@ from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.studies.front import compared, point_at
+from gcs.studies.front import compared, point_at, searched_in
 from gcs.studies.virtual import fly_virtual
 from gcs.watch.before_flight import measured_now
 from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, load
 from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
-from scenarios.schema import Control, Scenario
+from scenarios.schema import Control, Response, Scenario
 from tests.support.fleets.logged_flight import flown, log_bytes
+from tests.support.fleets.own_code import coded
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -132,6 +133,14 @@ def test_a_scenario_for_measured_links_is_not_designed_without_them() -> None:
     control = Control(for_link="measured", delay_margin_s=0.3)
     with pytest.raises(ScenarioError, match=r"control.for_link"):
         checked(CHAIN.model_copy(update={"control": control}), Path("chain3.toml"))
+
+
+def test_gains_for_a_link_are_refused_to_vehicles_that_do_not_respond_at_once() -> None:
+    late = coded(dynamics="lagged").model_copy(update={"response": Response(lag_s=0.2), "control": Control()})
+    with pytest.raises(InputError, match=r"read a \[response\], wanted vehicles that respond at once"):
+        searched_in(late)
+    with pytest.raises(ScenarioError, match=r"for_link: read 'measured', wanted off, with a \[response\]"):
+        checked(late.model_copy(update={"control": Control(for_link="measured")}), Path("own.toml"))
 
 
 def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> None:

@@ -3,6 +3,7 @@
 import itertools
 import json
 import sys
+from math import hypot
 from pathlib import Path
 
 import pytest
@@ -150,3 +151,54 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     # slow at first and fast before the end: commands do act
     ramp = Link(delay_points=(DelayPoint(at_s=0.0, delay_s=4.0), DelayPoint(at_s=1.0, delay_s=0.0)))
     assert endless_link(short.model_copy(update={"links": Links(up=ramp, down=ramp)})) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (
+            [("up = { delay_s = 0.02 }", "up = { delay_s = 0.02, loss_probability = 1.0 }")],
+            "read loss_probability 1 to",
+        ),
+        (
+            [
+                (
+                    "up = { delay_s = 0.02 }",
+                    'up = { delay_s = 0.02, jitter = { distribution = "uniform", scale_s = 60 } }',
+                )
+            ],
+            "wanted less than the 20 s that the station waits",
+        ),
+    ],
+)
+def test_links_that_let_nothing_through_are_refused(
+    changes: list[tuple[str, str]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    file = str(chain_file(tmp_path, *changes))
+    for command in (("check",), ("fly", "--virtual")):
+        assert told in complaint(capsys, monkeypatch, *command, file)
+
+
+def test_places_nearer_than_a_collision_are_refused() -> None:
+    _, second, third = CHAIN.vehicles
+    assert second.offset_ne_m == third.offset_ne_m
+    wanted_m = hypot(*second.offset_ne_m)
+    # the vehicles start farther apart than they are to fly
+    apart = [
+        vehicle.model_copy(update={"position_ne_m": (-(wanted_m + 10.0) * k, 0.0)})
+        for k, vehicle in enumerate(CHAIN.vehicles)
+    ]
+    safety = CHAIN.safety.model_copy(update={"collision_distance_m": wanted_m + 5.0, "spacing_error_limit_m": 1e4})
+    fault = bad_start(CHAIN.model_copy(update={"vehicles": tuple(apart), "safety": safety})) or ""
+    assert fault.startswith("vehicles.offset_ne_m: read places of vehicles")
+    assert f"wanted at least safety.collision_distance_m = {wanted_m + 5.0:g} m" in fault
+
+
+def test_a_speed_that_simulated_copters_cannot_fly_is_refused() -> None:
+    copters = load(ROOT / "scenarios/copters5.toml")
+    assert bad_start(copters) is None
+    [entry] = copters.nominal_velocity
+    fast = copters.model_copy(update={"nominal_velocity": (entry.model_copy(update={"velocity_ne_m_s": (60.0, 0.0)}),)})
+    wanted = "nominal_velocity: read 60 m/s, wanted at most autopilot.speed_max_m_s = 12 m/s"
+    assert bad_start(fast) == wanted

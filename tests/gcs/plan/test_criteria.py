@@ -60,7 +60,7 @@ def test_a_scenario_is_designed_for_its_delay() -> None:
         ("[control.criteria]\ndelays_s = [0.2, 0.1]", "the smaller delay first"),
         ("[control.criteria]\ndelay_rate = 0.5", "no such key without delays_s"),
         ("[control.overlap]\nahead = 2", "unless method is graph-lqr"),
-        ('prediction = "measured"\n[control.criteria]\ndamping_min = 0.5', "no such key with dynamics"),
+        ('prediction = "measured"\n[control.criteria]\ndamping_min = 0.5', "no such key with prediction"),
         ("gains = { K1 = -1.0, K2 = 0.0, K3 = 1.0 }\n[control.criteria]\ndamping_min = 0.5", "either criteria"),
         ("[control.criteria]\ndamping_min = 1.5", "1"),
     ],

@@ -1,0 +1,47 @@
+"""Commands and their answers, which do not say what they answer."""
+
+from gcs.link import mavlink
+from gcs.link.kinds import SET_MESSAGE_INTERVAL
+from gcs.link.startup import LaunchedStartup
+from gcs.link.vehicle import RemoteVehicle
+from scenarios.schema import NS_PER_S
+
+ACCEPTED = (SET_MESSAGE_INTERVAL, 0, 0, 0, 0, 0)
+
+
+def requested(frame: bytes | None) -> float:
+    """The message whose rate a frame asks for."""
+    assert frame is not None
+    [parsed] = mavlink.decode(frame, {})  # pyright: ignore[reportArgumentType] - nothing is refused
+    assert parsed.msg_id == mavlink.COMMAND_LONG
+    return parsed.fields[0]
+
+
+def asked_twice() -> RemoteVehicle:
+    """A vehicle that was asked twice for positions, before the first answer came."""
+    vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0, target_hz=10.0))
+    vehicle.address = "127.0.0.1", 1
+    assert requested(vehicle.next_frame(0)) == mavlink.LOCAL_POSITION_NED
+    assert requested(vehicle.next_frame(NS_PER_S)) == mavlink.LOCAL_POSITION_NED
+    vehicle.acknowledge(ACCEPTED, NS_PER_S + 1)
+    assert requested(vehicle.next_frame(NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
+    return vehicle
+
+
+def test_a_second_answer_to_a_request_is_none_to_the_next() -> None:
+    vehicle = asked_twice()
+    vehicle.acknowledge(ACCEPTED, NS_PER_S + 3)
+    assert requested(vehicle.next_frame(2 * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
+    vehicle.acknowledge(ACCEPTED, 2 * NS_PER_S + 3)
+    assert "message" not in vehicle.missing
+    assert "telemetry rate" not in vehicle.missing
+
+
+def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
+    vehicle = asked_twice()
+    # the second answer was lost; this one, taken for it, does not end the request either
+    vehicle.acknowledge(ACCEPTED, NS_PER_S + 3)
+    for k in range(2, 5):
+        vehicle.heard_ns = k * NS_PER_S
+        assert requested(vehicle.next_frame(k * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
+    assert "telemetry rate" in vehicle.missing
