@@ -231,8 +231,8 @@ class Monitor(Part):
     blend_s: Positive = 1.0
     """How long a change of gains takes."""
     time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (1.0, 2.0, 4.0)
-    """The gain schedule: the design slowed down in time by each factor. If vehicles respond at once, the delay margin is
-    multiplied by it."""
+    """The gain schedule: the design slowed down in time by each factor. If vehicles respond at once, it multiplies the
+    delay margin."""
     open_factor: Factor = 1.5
     """When even the slowest gains have too little headroom, every spacing is multiplied by this."""
     open_s: Positive = 10.0

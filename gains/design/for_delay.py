@@ -265,7 +265,7 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None
     found = _best(family, parts, cost, family.starts, evaluations)
     most: list[Reached] = []
     for part in parts if not _meets(found[1], parts) else ():
-        most.append(_most(family, part, parts))
+        most.append(_most(family, part, parts, evaluations))
         if _meets(most[-1][1], parts):
             better = _best(family, parts, cost, [most[-1][0]], evaluations)
             return better if _meets(better[1], parts) else most[-1]
@@ -300,14 +300,16 @@ def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> st
     return ""
 
 
-def _most(family: GainFamily, part: Part, parts: Sequence[Part]) -> Reached:
+def _most(
+    family: GainFamily, part: Part, parts: Sequence[Part], evaluations: int | None = None
+) -> Reached:
     """The gains that reach most of a part of those that meet all others.
 
     How much is wanted of the part does not matter, so that whoever wants what they reach finds the same gains.
     """
     sign = 1.0 if part.at_least else -1.0
     others = [other for other in parts if other is not part]
-    return _best(family, others, lambda figures: -sign * part.figure(figures), family.starts, None)
+    return _best(family, others, lambda figures: -sign * part.figure(figures), family.starts, evaluations)
 
 
 def _best(
