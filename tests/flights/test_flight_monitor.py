@@ -14,7 +14,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.tick import Event, Mode, TickArray
+from gcs.drive.flown import fly_plan
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -150,3 +152,15 @@ def test_a_collision_breaks_the_flight_and_least_distance_is_summarised() -> Non
     summary = summarise(planned().scenario, Design(delay_margin_s=0.3), ticks, events)
     assert summary.verdict == "unstable"
     assert 0.0 < known(summary.distance_min_m) < 180.0
+
+
+def test_the_alpha_of_a_flight_is_that_of_the_gains_flown_longest() -> None:
+    late = load(SCENARIOS / "chain3.toml").with_link_delay(up_s=0.17, down_s=0.17)
+    designed, plan = flight_plan(late.model_copy(update={"duration_s": 20.0}))
+    flight = fly_plan(plan)
+    found = summarise(plan.scenario, designed, flight.ticks, flight.events).at_loop_delay
+    longest = int(np.bincount(flight.ticks["gain_set"][flight.ticks["commanded"]]).argmax())
+    assert longest > 0
+    assert figures_at(designed, late, found.loop_delay_s).alpha == 0.0  # of the first gains, beyond their margin
+    assert known(found.alpha) > 0.1
+    assert found == figures_at(designed, late, found.loop_delay_s, longest)
