@@ -300,9 +300,7 @@ def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> st
     return ""
 
 
-def _most(
-    family: GainFamily, part: Part, parts: Sequence[Part], evaluations: int | None = None
-) -> Reached:
+def _most(family: GainFamily, part: Part, parts: Sequence[Part], evaluations: int | None = None) -> Reached:
     """The gains that reach most of a part of those that meet all others.
 
     How much is wanted of the part does not matter, so that whoever wants what they reach finds the same gains.

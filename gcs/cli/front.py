@@ -47,9 +47,9 @@ Save = Annotated[
 
 # whose gains a comparison uses
 _GAINS = {
-    "fastest": "decay fastest at the delay",
-    "least": "tolerate most of those that decay as fast",
-    "own": "of the scenario",
+    "fastest": "the static gains that decay fastest at the delay",
+    "least": "the smallest gains with this decay, which tolerate the longest delay",
+    "own": "the scenario's gains",
 }
 
 
@@ -178,14 +178,16 @@ def _print_comparison(found: "Comparison") -> None:
     }
     console = plain_console()
     for line in (
-        f"decay    {found.ways[0].decay_rate_1_s:.3f} 1/s without mismatch; half: half-way to the ends of the share",
-        "delay    the longest in ms at this decay: that of any static gains, and predicted,",
-        "         stable at every constant delay within the share under pred",
+        f"decay    {found.ways[0].decay_rate_1_s:.3f} 1/s of every row, without mismatch",
         *(
             f"{name:8} {_GAINS[name]}: K1 {way.K1:.3f}, K2 {way.K2:.3f}, K3 {way.K3:.3f}"
             for name, way in {way.gains: way for way in found.ways}.items()
         ),
-        "gain     disturbance to spacing error in s²; noise to commands; peak: string peak",
+        "pred     off, or by how much the delay may differ from the assumed one",
+        "delay    the longest loop delay in ms: of any static gains, or with prediction",
+        "stable   the loop delays at which it stays stable",
+        "half     decay in 1/s at a mismatch of half of pred",
+        "peak     string peak; gain: from disturbance to spacing error in s²; noise: to commands",
     ):
         console.print(line)
     console.print(table_of(found.ways, columns, dense=True))

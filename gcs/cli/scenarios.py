@@ -135,6 +135,9 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, margin {margin}: "
         f"headroom {number_text(found.headroom, '.0%')}"
     )
+    if found.loop_delay_s_p99 is not None:
+        late = f"{ms_text(found.loop_delay_s_p99)} at most for 99 % of the set-points"
+        console.print(f"         {late}: headroom {number_text(found.headroom_p99, '.0%')}")
     if found.channels_not_included:
         console.print("         without the time that datagrams wait for their channel, which only a flight shows")
     if found.closest_m is not None:

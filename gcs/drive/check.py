@@ -9,12 +9,14 @@ from pydantic import Field
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
-from gcs.plan.expected_delay import expected_loop_delay_s, waits_for_channels
+from gcs.plan.expected_delay import expected_loop_delay_s, late_loop_delay_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.own_law import code_by_key
 from gcs.published import Published
 from scenarios.schema import Scenario
+
+_LATE = 0.99
 
 
 class VehicleCheck(Published):
@@ -67,6 +69,10 @@ class ScenarioCheck(Published):
     headroom: float | None
     """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
     any margin."""
+    loop_delay_s_p99: float | None
+    """The loop delay that 99 % of the set-points keep, over the slowest links; None with prediction or on board."""
+    headroom_p99: float | None
+    """The headroom at that delay."""
     closest_m: float | None
     """Least distance between two vehicles in their places over the flight; None for a single vehicle."""
     closest_s: float | None
@@ -111,17 +117,22 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             )
         )
     delay_s = expected_loop_delay_s(scenario)
+    is_plain = scenario.control.loop == "ground" and scenario.control.prediction == "off"
     known_s = {"off": 0.0, "measured": delay_s}
     assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
     tolerated = plan.tolerance(assumed_s)
     margin_s = tolerated.longer_s[0]
     left = headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s)
+    late_s = late_loop_delay_s(scenario, _LATE) if is_plain else None
+    left_late = None if late_s is None else headroom(late_s, margin_s)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
         channels_not_included=waits_for_channels(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
         headroom=left if isfinite(left) else None,
+        loop_delay_s_p99=late_s,
+        headroom_p99=left_late if left_late is not None and isfinite(left_late) else None,
         closest_m=None if nearest is None else nearest.distance_m,
         closest_s=None if nearest is None else nearest.time_s,
         course=_course(scenario) if scenario.course.is_smooth else None,

@@ -53,6 +53,13 @@ def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
     return ages + rng.choice(_arrival_delays_s(scenario, down, rng), len(ages))
 
 
+def late_loop_delay_s(scenario: Scenario, share: float) -> float:
+    """The loop delay (s) that a share of the set-points keeps, over the slowest links of a loop on the ground."""
+    links = {scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
+    drawn = (drawn_loop_delays_s(scenario, up, down) for up, down in links)
+    return max(float(np.quantile(delays_s, share)) for delays_s in drawn)
+
+
 def waits_for_channels(scenario: Scenario) -> bool:
     """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
     return any(

@@ -119,7 +119,6 @@ def test_copters_beyond_their_window_grow_apart_as_computed() -> None:
 
 def test_copters_within_their_window_do_not_grow_apart() -> None:
     flight = settled_then_slower(planned(ASSUMED_S, 0.59), -0.05)
-    # what the change of the delay excites is at most 0.1 mm; it dies away
+    # what the change of the delay excites, up to 8 mm, dies away to the noise of telemetry
     for vehicle in (2, 3):
-        error_m = flight.error_m(vehicle)
-        assert error_m[2000:].max() < min(2e-4, error_m[1500:2000].max())
+        assert flight.error_m(vehicle)[-1000:].max() < 1e-4

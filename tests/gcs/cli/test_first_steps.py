@@ -103,7 +103,7 @@ def test_names_of_shipped_scenarios_are_taken_in_place_of_files(
         ("fly chain33 --virtual", "chain33"),
         ("new mine.txt", "read mine.txt, wanted a file name that ends in .toml"),
         ("new there.toml", "there.toml: read a file that exists, wanted a new one"),
-        ("new mine.toml --chain 0", "--chain: read 0, wanted 1 to 254 vehicles"),
+        ("new mine.toml --chain 0", "--chain: read 0, wanted 1 to 250 vehicles"),
         ("new mine.toml --columns 20x20", "--columns: read '20x20', wanted columns and vehicles in each, such as 3x4"),
         ("new mine.toml --columns ax4", "--columns: read 'ax4', wanted"),
         ("new mine.toml --like nothing", "--like: read nothing, wanted one of chain20, chain3"),
