@@ -23,7 +23,7 @@ from tests.soak.soak_flight import Flown, fly
 from tests.soak.soak_judge import judge
 from tests.support.paths import ROOT, SCENARIOS
 
-SEED, PARTS, FLIGHTS = 20, 20, 3
+SEED, PARTS, FLIGHTS = 20, 14, 3
 UNDRAWN = {"FormationChange", "ChangedOffset", "Sector", "Criteria", "CodeFile"}
 """Parts that only tests of their own fly: the invariants expect errors of one shape that decay, and quick designs."""
 

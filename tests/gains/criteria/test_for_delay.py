@@ -113,7 +113,9 @@ BOTH = WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5}
         ),
         # neither is reached however far the other one is relaxed
         pytest.param("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}, marks=LONG),
-        ("graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}),
+        pytest.param(
+            "graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}, marks=LONG
+        ),
         pytest.param("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}, marks=LONG),
         pytest.param(
             "inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}, marks=LONG
