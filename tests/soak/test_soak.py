@@ -128,7 +128,7 @@ def test_every_part_of_the_schema_is_drawn() -> None:
             return {type(value).__name__}.union(*(parts(getattr(value, name)) for name in type(value).model_fields))
         return set().union(*(parts(one) for one in value)) if isinstance(value, tuple) else set()
 
-    drawn = set().union(*(parts(experiment(SEED, number).scenario) for number in range(60)))
+    drawn = set().union(*(parts(experiment(SEED, number).scenario) for number in range(PARTS * FLIGHTS)))
     assert drawn | UNDRAWN == {one.__name__ for one in schema.Part.__subclasses__()}
 
 

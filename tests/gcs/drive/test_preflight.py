@@ -182,6 +182,7 @@ def test_links_that_let_nothing_through_are_refused(
 
 def test_places_nearer_than_a_collision_are_refused() -> None:
     _, second, third = CHAIN.vehicles
+    assert second.offset_ne_m is not None
     assert second.offset_ne_m == third.offset_ne_m
     wanted_m = hypot(*second.offset_ne_m)
     # the vehicles start farther apart than they are to fly
