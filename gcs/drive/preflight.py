@@ -90,11 +90,11 @@ def bad_start(scenario: Scenario) -> str | None:
             read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
             wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
             return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
-    speeds_m_s = [hypot(*entry.velocity_ne_m_s) for entry in scenario.nominal_velocity]
-    fastest_m_s = max([*speeds_m_s, scenario.course.speed_m_s or 0.0])
-    if scenario.dynamics == "autopilot" and fastest_m_s > scenario.autopilot.speed_max_m_s:
-        wanted = f"at most autopilot.speed_max_m_s = {scenario.autopilot.speed_max_m_s:g} m/s"
-        return f"nominal_velocity: read {fastest_m_s:g} m/s, wanted {wanted}"
+    speeds_m_s = [("nominal_velocity", hypot(*entry.velocity_ne_m_s)) for entry in scenario.nominal_velocity]
+    for key, speed_m_s in (*speeds_m_s, ("course.speed_m_s", scenario.course.speed_m_s or 0.0)):
+        if scenario.dynamics == "autopilot" and speed_m_s > scenario.autopilot.speed_max_m_s:
+            wanted = f"at most autopilot.speed_max_m_s = {scenario.autopilot.speed_max_m_s:g} m/s"
+            return f"{key}: read {speed_m_s:g} m/s, wanted {wanted}"
     place = {vehicle.system_id: vehicle.position_ne_m for vehicle in vehicles}
     for vehicle, offset in zip(vehicles, offset_ne_m.tolist(), strict=True):
         if vehicle.follows is None:

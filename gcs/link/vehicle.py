@@ -262,8 +262,8 @@ class RemoteVehicle:
             waiting.sent_ns = now_ns
             return
         earlier, answers = self._earlier
-        if earlier == command and answers > 0:  # says nothing of this request
-            self._earlier = earlier, answers - 1
+        if earlier == command and answers > 0 and now_ns - waiting.sent_ns < (self.clock.rtt_ns or 0):
+            self._earlier = earlier, answers - 1  # too soon for an answer to this request
             return
         self._command = None
         self._earlier = command, waiting.confirmation
@@ -291,8 +291,8 @@ class RemoteVehicle:
         """The frame that is due to bring the vehicle to the wanted state, if any: a command, else a parameter.
 
         One command at a time awaits its ACK, which carries no request id. Without an answer for three round trips, and
-        1 s at least, the command is sent again with its confirmation raised. Then there may be several answers: the
-        later ones do not count for the next request with the same command.
+        1 s at least, the command is sent again with its confirmation raised. Then there may be several answers:
+        one that comes sooner than a round trip after the next request with the same command does not count for that.
         """
         self._now_ns = now_ns
         if self.address is None:

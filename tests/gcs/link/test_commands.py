@@ -21,6 +21,7 @@ def asked_twice() -> RemoteVehicle:
     """A vehicle that was asked twice for positions, before the first answer came."""
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0, target_hz=10.0))
     vehicle.address = "127.0.0.1", 1
+    vehicle.clock.rtt_ns = 3 * NS_PER_S // 10
     assert requested(vehicle.next_frame(0)) == mavlink.LOCAL_POSITION_NED
     assert requested(vehicle.next_frame(NS_PER_S)) == mavlink.LOCAL_POSITION_NED
     vehicle.acknowledge(ACCEPTED, NS_PER_S + 1)
@@ -34,6 +35,13 @@ def test_a_second_answer_to_a_request_is_none_to_the_next() -> None:
     assert requested(vehicle.next_frame(2 * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
     vehicle.acknowledge(ACCEPTED, 2 * NS_PER_S + 3)
     assert "message" not in vehicle.missing
+    assert "telemetry rate" not in vehicle.missing
+
+
+def test_an_answer_after_a_round_trip_is_to_the_newest_request() -> None:
+    vehicle = asked_twice()
+    # the first copy was never answered: the vehicle was still booting
+    vehicle.acknowledge(ACCEPTED, NS_PER_S + 2 + 3 * NS_PER_S // 10)
     assert "telemetry rate" not in vehicle.missing
 
 
