@@ -424,6 +424,7 @@ class VehicleClock:
         off_ns = max(0.0, self._explained_ns - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
         if off_ns > 0.0:
             offset_ns = min(max(float(_sum(weight * y) - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
+            ways_ns = max(ways_ns, float(least))  # this line is only as good as the quickest exchange
         # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
         if ways_ns > self._ways_ns + 2.0 * ageing * (now_ns - self._fitted_ns) + _FLOOR_NS:
             skew, offset_ns = known.skew, float(known.offset_at_ns(now_ns) - base)

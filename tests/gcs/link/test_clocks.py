@@ -110,6 +110,25 @@ def test_a_way_that_slows_down_alone_does_not_shift_the_clock() -> None:
     assert abs(truth.error_ns(72 * S)) < 2 * MS  # 20e-6 for 70 s, the drift that jitter hides, and less than 1 ms
 
 
+@pytest.mark.parametrize("begin_ms", range(20_000, 20_500, 25))
+def test_exchanges_during_a_change_of_both_ways_do_not_shift_the_clock(begin_ms: int) -> None:
+    """Both ways slow down within 0.5 s. When earlier exchanges leave the window, asymmetric ones are its quickest."""
+    truth = Exchange(offset_ns=5 * S, drift=10e-6)
+    truth.clock.expected_error_ns = 5 * MS
+
+    def way_ns(time_ns: int) -> int:
+        return 595 * MS + round(64 * MS * min(max((time_ns - begin_ms * MS) / (S / 2), 0.0), 1.0))
+
+    offs_ns: list[int] = []
+    for sent_ns in range(0, 50 * S, 100 * MS):
+        down_ns = way_ns(sent_ns)
+        up_ns = way_ns(sent_ns + down_ns)
+        truth.at(sent_ns, down_ns=down_ns, up_ns=up_ns)
+        state(truth, sent_ns + down_ns + up_ns, up_ms=595)
+        offs_ns.append(abs(truth.error_ns(sent_ns + down_ns + up_ns)))
+    assert max(offs_ns[50:]) < 0.2 * MS
+
+
 def test_first_states_tell_what_few_exchanges_leave_open() -> None:
     """Five exchanges whose replies all queued; the states between them did not."""
     seen, unseen = Exchange(offset_ns=5 * S, drift=0.0), Exchange(offset_ns=5 * S, drift=0.0)
