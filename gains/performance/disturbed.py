@@ -169,7 +169,7 @@ class DisturbedFormation:
             W[n:, n:] = np.eye(size - n) * 2.0 * self.gusts.deviation_m_s2**2 / self.gusts.correlation_s
         block = np.zeros((2 * size, 2 * size))
         block[:size, :size], block[:size, size:], block[size:, size:] = -A, W, A.T
-        whole = matrix_exponentials(block[np.newaxis] * self.period_s)[0]
+        whole = matrix_exponentials(block, np.array([self.period_s]))[0]
         covariance = whole[size:, size:].T @ whole[:size, size:]
         return (covariance + covariance.T) / 2.0
 

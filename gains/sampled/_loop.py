@@ -61,7 +61,7 @@ class HeldPlant:
         n, inputs = self.B.shape
         generator = np.zeros((n + inputs, n + inputs))
         generator[:n, :n], generator[:n, n:] = self.A, self.B
-        exponentials = matrix_exponentials(duration_s[:, np.newaxis, np.newaxis] * generator)
+        exponentials = matrix_exponentials(generator, duration_s)
         return exponentials[:, :n, :n], exponentials[:, :n, n:]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
@@ -80,24 +80,24 @@ def carry(A: FloatArray, measured: BoolArray | None, duration_s: FloatArray) -> 
     """See `HeldPlant.carry`."""
     seen = np.arange(len(A)) if measured is None else np.flatnonzero(measured)
     maps = np.zeros((duration_s.size, *A.shape))
-    exponents = duration_s[:, np.newaxis, np.newaxis] * A[np.ix_(seen, seen)]
-    maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(exponents)
+    maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(A[np.ix_(seen, seen)], duration_s)
     return maps
 
 
-def matrix_exponentials(exponents: FloatArray) -> FloatArray:
-    """e^X for a stack of matrices (k, n, n), by a Taylor polynomial, scaling and squaring.
+def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatArray:
+    """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
 
-    SciPy's `expm` takes 60 us for each matrix of a stack; the margins need hundreds of small ones.
+    The powers of X are those of all durations: SciPy's `expm` takes 60 us for each matrix of a stack.
     """
-    norm = float(np.abs(exponents).sum(axis=-1).max(initial=0.0))
+    longest = float(durations.max(initial=0.0))
+    norm = float(np.abs(generator).sum(axis=-1).max(initial=0.0)) * longest
     squarings = max(0, int(np.ceil(np.log2(norm / 0.5)))) if norm > 0.0 else 0
-    scaled = exponents / 2.0**squarings
-    identity = np.eye(exponents.shape[-1])
-    result = identity + scaled / 14.0
-    # Horner's scheme; the first omitted term is 0.5^15 / 15! < 2e-17
-    for degree in range(13, 0, -1):
-        result = identity + scaled @ result / degree
+    scaled, terms = generator * (longest / 2.0**squarings), [np.eye(len(generator))]
+    # the first omitted term is 0.5^15 / 15! < 2e-17
+    for degree in range(1, 15):
+        terms.append(scaled @ terms[-1] / degree)
+    shares = durations / longest if longest > 0.0 else durations
+    result = np.tensordot(np.vander(shares, 15, increasing=True), np.array(terms), 1)
     for _ in range(squarings):
         result = result @ result
     return result

@@ -165,7 +165,7 @@ class LocalPlant:
         following = np.ceil(begin - _SAME_INSTANT).astype(np.int64)
         rest_s = np.maximum(following - begin, 0.0) * self._step_s
         # from the state alone: what the sensor saw at an earlier step does not depend on it
-        whole = self._ends[following] @ matrix_exponentials(rest_s[:, np.newaxis, np.newaxis] * self._generator)
+        whole = self._ends[following] @ matrix_exponentials(self._generator, rest_s)
         return whole[:, :n, :n], whole[:, :n, 3 * n :]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
@@ -175,7 +175,7 @@ class LocalPlant:
             first, last = (ceil(instant / self._step_s - _SAME_INSTANT) for instant in (begin_s, end_s))
             stops = np.array([begin_s, *(self._step_s * k for k in range(first, last)), end_s])
             whole = np.eye(len(self._generator))
-            for k, flow in enumerate(matrix_exponentials(np.diff(stops)[:, np.newaxis, np.newaxis] * self._generator)):
+            for k, flow in enumerate(matrix_exponentials(self._generator, np.diff(stops))):
                 whole = flow @ (whole if k == 0 else self._step(first + k - 1) @ whole)
             maps.append(whole)
         every = np.array(maps)
@@ -184,7 +184,7 @@ class LocalPlant:
     @cached_property
     def _ends(self) -> FloatArray:
         """Maps to the period's end, of the state and the held input: from just before each step, and from the end."""
-        [flow] = matrix_exponentials(self._step_s * self._generator[np.newaxis])
+        [flow] = matrix_exponentials(self._generator, np.array([self._step_s]))
         maps = [np.eye(len(flow))]
         for number in reversed(range(self.timing.steps)):
             maps.append(maps[-1] @ flow @ self._step(number))

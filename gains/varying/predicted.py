@@ -175,7 +175,7 @@ def _integral(A: FloatArray, B: FloatArray, computed: BoolArray) -> float:
         return 0.0
     settled_s = _SETTLED / float(-np.linalg.eigvals(own).real.max())
     at_s = np.linspace(0.0, settled_s, _INSTANTS)
-    sizes = spectral_norms(matrix_exponentials(at_s[:, np.newaxis, np.newaxis] * own) @ entry)
+    sizes = spectral_norms(matrix_exponentials(own, at_s) @ entry)
     return float(np.trapezoid(sizes, at_s))
 
 

@@ -191,4 +191,4 @@ class _Flow:
         return z + rest_s * slope + 0.5 * rest_s * rest_s * (self._generator @ slope)
 
     def _exponential(self, steps: int) -> FloatArray:
-        return matrix_exponentials(steps * _GRID_S * self._generator[np.newaxis])[0]
+        return matrix_exponentials(self._generator, np.array([steps * _GRID_S]))[0]
