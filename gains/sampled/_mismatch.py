@@ -5,11 +5,12 @@ Its starting points come from loci: with a delay of q + m common periods, q whol
 So z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus does not depend on q and only little on m. Where N is large,
 they are the crossings of the continuous loop, and delays within the window are looked at too. Loci can miss a short
 stretch of instability around a kink, a delay at which a command starts to act as a state is sampled: kinks are looked
-at where there are few. Each end is confirmed on either side: within by the spectrum of the lifted map, or by Nyquist's
-criterion if that map is large, and beyond by the faster of the two. If another end lies nearer, bisection finds
-starting points closer to the assumed delay.
+at where there are few. Each end is confirmed on either side by the spectrum of the map of one common period, or by
+Nyquist's criterion if that map is large. If another end lies nearer, bisection finds starting points closer to the
+assumed delay.
 """
 
+from collections.abc import Sequence
 from math import inf, log, pi
 from typing import NamedTuple
 
@@ -23,48 +24,58 @@ from gains.delay._loci import log_moduli, solved_beside_poles
 from gains.sampled._continuous_mismatch import continuous_crossings, highest_crossing
 from gains.sampled._loop import HeldPlant, radius_of
 from gains.sampled._predicted_difference import PredictedDifference
-from gains.sampled.multirate import Predictor, Timing, multirate_map
+from gains.sampled.multirate import Timing
 
 # fractions of a period at which loci are computed, twice as many at two rates; the angle (rad) in a period below which
-# one is enough, and kinks do not matter; the largest N of which they are computed at two rates, and of which det(I - N)
-# takes less time than a spectrum; and the delays in a period at which det(I - N) is computed at z = -1 and 1
-_FRACTIONS, _SLOW, _FEW, _QUICK, _AT_ONE = 4, 1.0, 4, 8, 16
+# one is enough, and kinks do not matter; the largest N of which they are computed at two rates; and the delays in a
+# period at which det(I - N) is computed at z = -1 and 1
+_FRACTIONS, _SLOW, _FEW, _AT_ONE = 4, 1.0, 4, 8
 # starting points to either side at most, and the assumed delay itself (control periods)
 _TRIED, _AT_ASSUMED = 16, 1e-9
 # Newton's method: steps, the last one (control periods) and that of a solution, and shares of angle and period for
 # derivatives
 _STEPS, _STILL, _SOLVED, _DIFFERENCE = 12, 1e-11, 1e-9, 1e-7
-# states of the largest lifted map whose spectrum is computed, and how many kinks are looked at, times the control
-# periods in a common one
-_LARGEST_CHECK, _KINKS = 100, 600
+# states of the largest map whose spectrum is computed, and how many kinks are looked at, times the control periods in a
+# common one
+_LARGEST_CHECK, _KINKS = 40, 600
 # shares of the mismatch at which the loop must be stable, how far beside its end it is looked at, how much farther each
 # look beyond is than the one before, and up to how many mismatches and common periods
 _WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
 _SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
+# how many windows of other blocks the continuous crossings of a block must be away, for a few looks to be enough
+_FAR = 1.5
 # halvings between two looks, after how many a solution is searched, from how many angles; and equal mismatches
 _HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 3, 1e-9
 
 
-def block_window(plant: HeldPlant, timing: Timing, assumed_s: float) -> tuple[float, float]:
+def common_window(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float) -> tuple[float, float]:
     """The nearest true (mean) loop delays (s) below and above the assumed one with an eigenvalue on the unit circle.
 
-    0 and `inf` if there is none, and `assumed_s` twice if the loop is unstable without mismatch. `plant` is held over
-    the common period.
+    0 and `inf` if there is none, and `assumed_s` twice if the loop is unstable without mismatch. `plants`, the blocks
+    of one loop, are held over the common period. The ends of a block are searched only if its continuous crossings are
+    not far outside the window of the others, or if it is not stable at all delays looked at within that.
     """
-    tick = plant.transition(np.array([timing.common_s / timing.ticks]))
-    if radius_of((tick[0] + tick[1] @ plant.K)[0]) >= 1.0:
-        return assumed_s, assumed_s
-    if not plant.K.any():
-        return 0.0, inf
-    shorter_s, longer_s = _Search(plant, timing, assumed_s).ends_s()
-    return max(0.0, assumed_s - shorter_s), assumed_s + longer_s
+    for plant in plants:
+        tick = plant.transition(np.array([timing.common_s / timing.ticks]))
+        if radius_of((tick[0] + tick[1] @ plant.K)[0]) >= 1.0:
+            return assumed_s, assumed_s
+    plants = [plant for plant in plants if plant.K.any()]
+    aside_s = [continuous_crossings(plant, assumed_s)[1] if len(plants) > 1 else np.zeros(0) for plant in plants]
+    nearest_s = [(-own[own < 0.0].max(initial=-inf), own[own > 0.0].min(initial=inf)) for own in aside_s]
+    shorter_s, longer_s = assumed_s, inf
+    for (below_s, above_s), plant in sorted(zip(nearest_s, plants, strict=True), key=lambda each: min(each[0])):
+        search = _Search(plant, timing, assumed_s)
+        is_far = below_s > _FAR * shorter_s + timing.common_s and above_s > _FAR * longer_s + timing.common_s
+        if not (is_far and search.is_stable_within(shorter_s, longer_s)):
+            own_s = search.ends_s()
+            shorter_s, longer_s = min(shorter_s, own_s[0]), min(longer_s, own_s[1])
+    return assumed_s - shorter_s, assumed_s + longer_s
 
 
 class _Looks(NamedTuple):
-    """Mismatches (s) in one direction: where the loop is judged, by its spectrum if possible, and all likely ends."""
+    """Mismatches (s) in one direction: where the loop is judged, the first that is likely beyond, all likely ends."""
 
     all_s: list[float]
-    precise_s: list[float]
     beyond_s: float
     ends_s: FloatArray
 
@@ -78,32 +89,37 @@ class _Search:
         self.tick_s, self.common_s = self.loop.tick_s, self.loop.common_s
         # at many angles, eigenvalues of larger matrices would take most of the time; determinants take less
         self.by_loci = timing.ticks == 1 or len(self.loop.sample) <= _FEW
-        self.is_quick = timing.ticks == 1 or len(self.loop.sample) <= _QUICK
-        self.aside_s = self._refined(*self._starts())
         self.stable = dict[float, bool]()
+
+    def is_stable_within(self, shorter_s: float, longer_s: float) -> bool:
+        """Whether the loop is stable at all delays looked at up to these mismatches (s)."""
+        ends_s = np.array([-shorter_s, longer_s])
+        looks = (self.assumed_s + np.outer((*_WITHIN, 1.0), ends_s)).ravel().tolist()
+        self._judge(looks)
+        return all(self.stable[look] for look in looks)
 
     def ends_s(self) -> tuple[float, float]:
         """How far (s) from the assumed delay the window ends below and above it."""
-        below, above = (self._looks(way) for way in (-1.0, 1.0))
-        # counted in one go: at many small matrices, the number of calls takes the time
-        self._count_turns(
+        aside_s = self._refined(*self._starts())
+        below, above = (self._looks(way, aside_s) for way in (-1.0, 1.0))
+        # in one go: at many small matrices, the number of calls takes the time
+        self._judge(
             [
                 self.assumed_s + way * aside_s
                 for way, own in ((-1.0, below), (1.0, above))
                 for aside_s in own.all_s
                 if aside_s <= own.beyond_s
-                and (self._is_large(self.assumed_s + way * aside_s) or (self.is_quick and aside_s not in own.precise_s))
             ]
         )
         return self._end_s(-1.0, below), self._end_s(1.0, above)
 
-    def _looks(self, way: float) -> _Looks:
+    def _looks(self, way: float, aside_s: FloatArray) -> _Looks:
         """Where the loop is judged below (-1) or above (1) the assumed delay, from the solutions found there."""
-        ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
+        ends_s, longest_s = way * aside_s, self.assumed_s if way < 0.0 else inf
         ends_s = np.sort(ends_s[ends_s > _AT_ASSUMED * self.tick_s])
         known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
-        precise = [(1.0 - _BESIDE) * known_s, *self._kinks(way, max(known_s, float(ends_s.max(initial=0.0))))]
-        looks, beyond_s = list(precise), inf
+        looks = [(1.0 - _BESIDE) * known_s, *self._kinks(way, max(known_s, float(ends_s.max(initial=0.0))))]
+        beyond_s = inf
         if not self.by_loci:  # these miss no crossing in between but those of a short stretch around a kink
             looks += [share * known_s for share in _WITHIN]
         if ends_s.size or (not self.by_loci and way > 0.0):
@@ -111,7 +127,7 @@ class _Search:
             last_s = min(longest_s, _SEARCHED * known_s + _SEARCHED_PERIODS * self.common_s)
             farther = _FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))
             looks += [beyond_s, *((1.0 + _BESIDE) * ends_s).tolist(), *(farther * known_s).tolist()]
-        return _Looks(sorted({min(longest_s, look) for look in looks}), precise, beyond_s, ends_s)
+        return _Looks(sorted({min(longest_s, look) for look in looks}), beyond_s, ends_s)
 
     def _end_s(self, way: float, looks: _Looks) -> float:
         stable_s = 0.0
@@ -156,7 +172,7 @@ class _Search:
     def _beside(self, delay_s: float) -> FloatArray:
         """Mismatches (s) of the solutions next to a true delay, from the angles at which eigenvalues are near there."""
         if not self._is_large(delay_s):
-            values = np.linalg.eigvals(self._lifted(delay_s)).astype(np.complex128)
+            values = np.linalg.eigvals(self.loop.maps(np.array([delay_s]))[0]).astype(np.complex128)
             angle = np.angle(values).astype(np.float64)
             nearest = np.argsort(np.abs(np.abs(values) - 1.0))
             angle = angle[nearest[angle[nearest] >= 0.0]][:_BESIDE_IT]
@@ -167,29 +183,25 @@ class _Search:
             angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
         return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
 
-    def _lifted(self, delay_s: float) -> FloatArray:
-        predictor = Predictor(self.plant, self.assumed_s)
-        return multirate_map(self.plant, self.timing, delay_s=delay_s, predictor=predictor)
-
     def _is_stable(self, delay_s: float) -> bool:
         """Whether the loop is stable at a true delay."""
         if delay_s not in self.stable:
-            if self._is_large(delay_s):
-                self._count_turns([delay_s])
-            else:
-                self.stable[delay_s] = radius_of(self._lifted(delay_s)) < 1.0
+            self._judge([delay_s])
         return self.stable[delay_s]
 
-    def _count_turns(self, delays_s: list[float]) -> None:
-        """Remember whether the loop is stable at each true delay, by Nyquist's criterion."""
-        if delays_s:
-            counted = zip(delays_s, self.loop.turns(delays_s), strict=True)
-            self.stable |= {delay_s: turns == 0 for delay_s, turns in counted}
+    def _judge(self, delays_s: list[float]) -> None:
+        """Remember whether the loop is stable at each true delay: by its spectrum, or by Nyquist's criterion."""
+        large = [delay_s for delay_s in delays_s if self._is_large(delay_s)]
+        small = [delay_s for delay_s in delays_s if not self._is_large(delay_s)]
+        if large:
+            self.stable |= zip(large, (turns == 0 for turns in self.loop.turns(large)), strict=True)
+        if small:
+            radii = np.abs(np.linalg.eigvals(self.loop.maps(np.array(small)))).max(axis=1)
+            self.stable |= zip(small, (radii < 1.0).tolist(), strict=True)
 
     def _is_large(self, delay_s: float) -> bool:
-        """Whether the lifted map has so many states that its spectrum takes too long."""
-        states = len(self.plant.A) + len(self.plant.K) * (max(delay_s, self.assumed_s) / self.tick_s + 2.0)
-        return states > _LARGEST_CHECK
+        """Whether the loop's map has so many states that its spectrum takes too long."""
+        return self.loop.states(delay_s) > _LARGEST_CHECK
 
     def _starts(self) -> tuple[FloatArray, FloatArray]:
         """Angles and mismatches (s) near the ends, the nearest to either side."""

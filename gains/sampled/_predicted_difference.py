@@ -13,7 +13,7 @@ v = N(z) v, with N = 0 where there is no mismatch. So where an eigenvalue is on 
 and the loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
 """
 
-from math import pi
+from math import ceil, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -130,8 +130,11 @@ class PredictedDifference:
 
     def seen_at(self, grid: Grid, answers: Answers) -> ComplexArray:
         """What the samples see of v through the commands, (k, m, m), with one true delay or k of them."""
-        turned = np.exp(1j * grid.angle[:, np.newaxis] * answers.exponents)[:, :, np.newaxis]
-        return turned * (answers.of_first.astype(np.complex128) @ grid.first + answers.of_v)
+        # real and imaginary parts side by side: a product of a real and a complex matrix takes twice as long
+        seen = (answers.of_first @ grid.first.view(np.float64)).view(np.complex128)
+        seen += answers.of_v
+        seen *= np.exp(1j * grid.angle[:, np.newaxis] * answers.exponents)[:, :, np.newaxis]
+        return seen
 
     def differences(self, grid: Grid, answers: Answers) -> ComplexArray:
         """I - N (k, m, m), with one true delay or k of them."""
@@ -141,6 +144,38 @@ class PredictedDifference:
         """det(I - N) (k,), none of them zero."""
         values = np.linalg.det(self.differences(grid, answers)).astype(np.complex128)
         return np.where(values == 0.0, _LEAST, values)
+
+    def states(self, delay_s: float) -> int:
+        """How many states `maps` have at a true delay."""
+        late_s = max(delay_s, self.assumed_s) - self.spread_s
+        return len(self.closed) + len(self.sample) * max(1, ceil(late_s / self.common_s - 1e-11))
+
+    def maps(self, delays_s: FloatArray) -> FloatArray:
+        """The loop's map of one common period at k true delays, (k, states, states).
+
+        Its state is X_0 of P periods ago and the v since then, the oldest first; nothing acts later than that.
+        """
+        answers, (n, m) = self.answers(delays_s), self.added[-1].shape
+        late = [-part.exponents.astype(np.int64) for part in (answers, self.by_assumed)]
+        periods = max(1, *(int(own.max()) for own in late))
+        # X_0 of each later period as a function of that state
+        first = np.zeros((periods + 1, n, n + periods * m))
+        first[0, :, :n] = np.eye(n)
+        for k in range(periods):
+            first[k + 1] = self.powers[-1] @ first[k]
+            first[k + 1, :, n + k * m : n + (k + 1) * m] += self.added[-1]
+        # of v in the state, and of v itself: what is seen by the true delay minus the same by the assumed one
+        seen = np.zeros((delays_s.size, m, n + (periods + 1) * m))
+        at = np.arange(delays_s.size)[:, np.newaxis, np.newaxis], np.arange(m)[:, np.newaxis]
+        for own, part, sign in zip(late, (answers, self.by_assumed), (1.0, -1.0), strict=True):
+            seen[..., : n + periods * m] += sign * (part.of_first[..., np.newaxis, :] @ first[periods - own])[..., 0, :]
+            seen[(*at, n + (periods - own)[..., np.newaxis] * m + np.arange(m))] += sign * part.of_v
+        maps = np.zeros((delays_s.size, n + periods * m, n + periods * m))
+        maps[:, :n] = first[1]
+        maps[:, n : n + (periods - 1) * m, n + m :] = np.eye((periods - 1) * m)
+        itself = n + periods * m
+        maps[:, itself - m :] = np.linalg.solve(np.eye(m) - seen[..., itself:], seen[..., :itself])
+        return maps
 
     def turns(self, delays_s: list[float]) -> list[int]:
         """How often det(I - N) goes around 0 as z goes around the unit circle, backwards, at each true delay."""

@@ -31,7 +31,7 @@ from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.sampled._continuous_mismatch import continuous_crossings
 from gains.sampled._loop import HeldPlant, held_blocks, rate_of
-from gains.sampled._mismatch import block_window
+from gains.sampled._mismatch import common_window
 from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
 
@@ -48,8 +48,8 @@ def mismatch_window(
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     0 if it is stable down to no delay, `inf` if no longer delay is found to be too long, and `assumed_s` twice if it is
-    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s. Each is confirmed within by
-    the spectrum of the lifted map, or by Nyquist's criterion if that is large, and beyond by the faster of the two.
+    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s. Each is confirmed on
+    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large.
     Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
@@ -66,8 +66,7 @@ def mismatch_window(
     """
     loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
     plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
-    ends_s = [block_window(plant, timing, late_s) for plant in plants]
-    return max(least for least, _ in ends_s), min(most for _, most in ends_s)
+    return common_window(plants, timing, late_s)
 
 
 def mismatch_window_continuous(

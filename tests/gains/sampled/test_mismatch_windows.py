@@ -8,11 +8,12 @@ import os
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_continuous_are
+from scipy.linalg import block_diag, solve_continuous_are
 
 from gains import Timing, mismatch_window
 from gains.core.arrays import FloatArray
 from gains.sampled._loop import HeldPlant
+from gains.sampled._predicted_difference import PredictedDifference
 from gains.sampled.multirate import Predictor, lifted_radius
 
 Loop = tuple[FloatArray, FloatArray, FloatArray]
@@ -94,6 +95,30 @@ def test_every_delay_within_a_window_is_stable(seed: int) -> None:
     assumed_s = rng.uniform(0.05, min(2.0, 40.0 * rates.common_s / rates.ticks))
     if np.linalg.eigvals(loop[0] + loop[1] @ loop[2]).real.max() < 0.0:
         assert_window(loop, rates, assumed_s, looks=90)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_blocks_far_from_their_ends_do_not_change_the_window(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    loops = random_loop(rng), first_order(0.0, 1.0, -rng.uniform(0.02, 1.0))
+    control_s = float(rng.choice([0.02, 0.05, 0.2]))
+    rates, assumed_s = Timing(control_s, control_s * float(rng.choice([1.0, 1.3, 2.5, 5.0]))), rng.uniform(0.0, 3.0)
+    A, B, K = (np.array(block_diag(*parts), np.float64) for parts in zip(*loops, strict=True))
+    ends_s = [mismatch_window(*loop, rates, assumed_s=assumed_s) for loop in loops]
+    narrowest_s = max(least_s for least_s, _ in ends_s), min(most_s for _, most_s in ends_s)
+    assert mismatch_window(A, B, K, rates, assumed_s=assumed_s) == pytest.approx(narrowest_s, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_maps_of_the_difference_have_the_radius_of_the_lifted_map(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    control_s = float(rng.choice([0.05, 0.2]))
+    rates, assumed_s = Timing(control_s, control_s * float(rng.choice([1.0, 1.3, 2.5, 5.0]))), rng.uniform(0.0, 1.5)
+    plant, delays_s = HeldPlant(*random_loop(rng), rates.common_s), rng.uniform(0.0, 3.0, 5)
+    maps = PredictedDifference(plant, rates, assumed_s).maps(delays_s)
+    for found, delay_s in zip(np.abs(np.linalg.eigvals(maps)).max(axis=1), delays_s.tolist(), strict=True):
+        lifted = lifted_radius(plant, rates, delay_s=delay_s, predictor=Predictor(plant, assumed_s))
+        assert found == pytest.approx(lifted, abs=1e-9)
 
 
 @pytest.mark.parametrize(
