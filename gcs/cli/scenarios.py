@@ -131,9 +131,16 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     print_design(design, console)
     margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
     margin = "unknown" if design.margin_unknown else margin
+    if found.mismatch_window_s is not None:
+        least_s, most_s = found.mismatch_window_s
+        stable = f"stable from {ms_text(least_s, unit='')} to {ms_text(most_s)}"
+        margin = f"predicted over {ms_text(found.assumed_delay_s)}: {stable}"
+    else:
+        margin = f"margin {margin}"
+    unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
     console.print(
-        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, margin {margin}: "
-        f"headroom {number_text(found.headroom, '.0%')}"
+        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, {margin}, "
+        f"headroom {number_text(found.headroom, '.0%')}{unstable}"
     )
     if found.loop_delay_s_p99 is not None:
         late = f"{ms_text(found.loop_delay_s_p99)} at most for 99 % of the set-points"

@@ -66,6 +66,11 @@ class ScenarioCheck(Published):
     """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
     delay_margin_s: float | None
     """None if no delay makes the loop unstable; with prediction the upper end of the mismatch window."""
+    assumed_delay_s: float | None
+    """The loop delay over which the station predicts, the expected one if it is measured; None without prediction."""
+    mismatch_window_s: tuple[float, float] | None
+    """The least and the largest loop delay at which the predicted loop is stable; None without prediction, or if there
+    is no largest."""
     headroom: float | None
     """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
     any margin."""
@@ -117,19 +122,22 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             )
         )
     delay_s = expected_loop_delay_s(scenario)
-    is_plain = scenario.control.loop == "ground" and scenario.control.prediction == "off"
+    is_predicted = scenario.control.prediction != "off"
     known_s = {"off": 0.0, "measured": delay_s}
     assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
     tolerated = plan.tolerance(assumed_s)
-    margin_s = tolerated.longer_s[0]
+    shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
+    window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
     left = headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s)
-    late_s = late_loop_delay_s(scenario, _LATE) if is_plain else None
+    late_s = late_loop_delay_s(scenario, _LATE) if scenario.control.loop == "ground" and not is_predicted else None
     left_late = None if late_s is None else headroom(late_s, margin_s)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
         channels_not_included=waits_for_channels(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
+        assumed_delay_s=assumed_s if is_predicted else None,
+        mismatch_window_s=window_s if is_predicted and margin_s < inf else None,
         headroom=left if isfinite(left) else None,
         loop_delay_s_p99=late_s,
         headroom_p99=left_late if left_late is not None and isfinite(left_late) else None,

@@ -95,6 +95,24 @@ def test_names_of_shipped_scenarios_are_taken_in_place_of_files(
 
 
 @pytest.mark.parametrize(
+    ("prediction", "wanted"),
+    [
+        ("0.6", "predicted over 600.0 ms: stable from 450.4 to 756.9 ms, headroom -268%: unstable"),
+        ('"measured"', "predicted over 50.0 ms: stable from 0.0 to 331.8 ms, headroom 100%"),
+        ('"off"', "margin 300.0 ms, headroom 83%"),
+    ],
+)
+def test_check_says_between_which_delays_a_predicted_loop_is_stable(
+    prediction: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = copied("triangle5", "mine").replace("[control]", f"[control]\nprediction = {prediction}")
+    Path("mine.toml").write_text(text)
+    assert gcs(monkeypatch, "check", "mine.toml") == 0
+    assert f"delay    loop 50.0 ms expected from the links, {wanted}\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
         ("fly chain3 --virtual --listen 127.0.0.1:0", "read --virtual and --listen, wanted one of them"),
