@@ -55,6 +55,7 @@ def first_time_s(station: Station, mode: Mode) -> float:
     return min(e.time_s for e in station.events if e.kind == "mode" and e.text.endswith(f"-> {mode.name}"))
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_monitored_formation_survives_three_times_its_first_margin(seed: int) -> None:
     shipped = load(SCENARIOS / "delay_ramp.toml")

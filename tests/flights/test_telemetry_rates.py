@@ -79,6 +79,7 @@ def test_flown_growth_is_that_of_the_model_at_these_rates(telemetry_hz: float, c
         assert outcome.loop_delay_s == pytest.approx(link_s, abs=plan.timing.faster_s)
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("telemetry_hz", [10.0, 30.0])
 def test_growth_flown_on_board_matches_the_model_at_these_rates(telemetry_hz: float) -> None:
     scenario = scenario_at(telemetry_hz, name="thesis_delay")

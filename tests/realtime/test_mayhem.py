@@ -1,7 +1,7 @@
 """A flight that is disturbed at a random instant: nothing is left of it but files, and the next one is right.
 
-`MAYHEM=20 python3 make.py test tests/realtime/test_mayhem.py` does each kind of harm twenty times; MAYHEM_SEED draws
-others.
+`SLOW_TESTS=1 MAYHEM=20 python3 make.py test tests/realtime/test_mayhem.py` does each kind of harm twenty times;
+MAYHEM_SEED draws others.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ SEED = int(os.environ.get("MAYHEM_SEED", "1"))
 FLIGHT_S = 3.0
 BEFORE_S, AFTER_S = 5.0, 1.5
 """About how long a flight needs to begin, and to write its files at the end."""
-KINDS = ("kill", "term", "hang up", "stop for 3 s", "disk full", "terminal closed")
+KINDS = ("kill", "stop for 3 s", "disk full", "term", "hang up", "terminal closed")
 
 
 class Run:
@@ -144,6 +144,7 @@ def fly(scenario: Path, port: int, folder: Path, *options: str) -> "subprocess.C
     )
 
 
+@pytest.mark.slow(first=3)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("time_no", range(TIMES))
 def test_harm_at_any_instant_leaves_whole_files_and_no_process(kind: str, time_no: int, tmp_path: Path) -> None:

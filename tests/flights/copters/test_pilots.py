@@ -44,6 +44,7 @@ def assert_left_alone(pilots: PilotsVehicle, mode: int) -> None:
     assert pilots.copter.mode == mode
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 3.0, -1000.0])
 def test_a_clock_jump_takes_no_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
@@ -106,6 +107,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
     assert numbers <= {SET_MESSAGE_INTERVAL}
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("after_the_end_s", [-1.5, 0.5, 2.0])
 def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_the_end_s: float) -> None:

@@ -21,6 +21,7 @@ def chain(**update: object) -> Scenario:
     return load(located("chain3")).with_calm_monitor().model_copy(update=update)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("prediction", ["off", "measured"])
 @pytest.mark.parametrize("delay_s", [0.05, 0.15, 0.25])
 def test_flown_spread_of_the_errors_is_the_computed_one(delay_s: float, prediction: str) -> None:

@@ -109,6 +109,7 @@ def test_a_flight_keeps_the_headroom_that_was_asked_for() -> None:
     assert np.nanmax(flight.loop_delay_s - flight.ticks["assumed_delay_s"]) > 0.08  # of 0.10 s tolerated
 
 
+@pytest.mark.slow(first=0)
 def test_gains_for_a_short_delay_are_designed_though_a_long_one_leaves_them_nothing() -> None:
     """Over the 20 ms of chain3 they are so fast that a prediction over 3 s would tolerate 1 ms."""
     flight = fly_virtual(CHAIN.model_copy(update={"control": Control(for_link="measured"), "duration_s": 2.0}))

@@ -67,6 +67,7 @@ def vehicle(fleet: Fleet, system_id: int) -> DoubleIntegrator:
     return found
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize(("link_delay_s", "verdict"), [(0.17, "stable"), (0.9, "stable"), (1.1, "unstable")])
 def test_the_source_breaks_beyond_the_computed_margin_not_its_own(link_delay_s: float, verdict: str) -> None:
     scenario = delayed(link_delay_s)

@@ -52,6 +52,7 @@ def errors_m(ticks: TickArray, *, from_s: float) -> float:
     return float(np.nanmax(np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])))
 
 
+@pytest.mark.slow(first=3)
 @pytest.mark.parametrize(
     ("assumed_s", "loop_s"),
     [
@@ -111,6 +112,7 @@ def test_least_gains_decay_as_fast_at_their_longest_delay() -> None:
     assert known(outcome.growth_1_s) == pytest.approx(-DECAY_1_S, rel=0.02)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("mismatch", [-0.0475, 0.0475, 0.06])
 def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> None:
     """A leader and its follower for 40 s: near the limit many modes are slow, and only time tells the slowest."""
@@ -150,6 +152,7 @@ def test_the_measured_delay_is_followed() -> None:
     assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("seed", [1, 5, 13])
 def test_drift_to_ten_margins_leaves_true_errors_below_1_percent(seed: int) -> None:
     """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost, at 91 m/s.

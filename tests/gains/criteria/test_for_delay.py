@@ -1,10 +1,9 @@
 """Gains searched for what is asked: met, or refused with relaxations that are feasible.
 
 Searches over all entries of a gain take up to a minute each. Those that take longest are left out, unless asked for:
-CRITERIA_SEARCHES=all python3 make.py test tests/gains/criteria/test_for_delay.py
+SLOW_TESTS=1 python3 make.py test tests/gains/criteria/test_for_delay.py
 """
 
-import os
 import re
 from dataclasses import replace
 from functools import cache
@@ -30,7 +29,6 @@ from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.constant import growth_rate, period_map
 from gains.varying.jitter import Jitter, bound_covering
 
-LONG = pytest.mark.skipif(os.environ.get("CRITERIA_SEARCHES") != "all", reason="takes up to a minute")
 PERIOD_S, LAG = 0.02, Response(lag_s=0.15, velocity_gain_1_s=2.0)
 CHAIN, PAIR, SINGLE = FormationModel((-1, 0, 1)), FormationModel((-1, 0), axes=1), FormationModel((-1, 0, 1), axes=1)
 MOST = "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max", "string_peak_max"
@@ -62,13 +60,16 @@ ASKED: list[tuple[float | None, dict[str, Any]]] = [
     (None, {"at_delay_s": 0.3, "discrete": True, "alpha_at_delay": 0.3, "maximise": "decay_rate_at_delay_1_s"}),
     (None, {"at_delay_s": 0.3, "alpha_at_delay": 0.4, "decay_rate_at_delay_1_s": 0.8, "weight": (1.0, 0.9)}),
 ]
+METHODS = "inclusion", "graph-lqr"
+QUICK = [("inclusion", 0), ("inclusion", 1), ("inclusion", 4), ("inclusion", 5), ("graph-lqr", 0)]
 
 
+@pytest.mark.slow(first=len(QUICK))
 @pytest.mark.parametrize(
     ("method", "margin_s", "criteria"),
     [
-        *(("inclusion", *asked) for asked in ASKED),
-        *(pytest.param("graph-lqr", *asked, marks=LONG if 0 < k < 5 else ()) for k, asked in enumerate(ASKED)),
+        *((method, *ASKED[k]) for method, k in QUICK),
+        *((method, *asked) for method in METHODS for k, asked in enumerate(ASKED) if (method, k) not in QUICK),
     ],
 )
 def test_a_criterion_is_met(method: str, margin_s: float | None, criteria: dict[str, Any]) -> None:
@@ -95,46 +96,29 @@ VARYING = {"delays_s": (0.0, 0.6), "delay_rate": 0.5}
 BOTH = WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5}
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize(
     ("method", "criteria", "named"),
     [
         ("inclusion", AT_DELAY, {"alpha_at_delay", "decay_rate_at_delay_1_s"}),
-        pytest.param("inclusion", WEIGHTED, {"alpha_at_delay"}, marks=LONG),
         (
             "inclusion",
             {"at_delay_s": 0.3, "discrete": True, "decay_rate_at_delay_1_s": 2.5},
             {"decay_rate_at_delay_1_s"},
         ),
-        pytest.param("inclusion", REGION, set(REGION), marks=LONG),
-        (
-            "inclusion",
-            {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0},
-            {"spacing_gain_max_s2", "noise_gain_max"},
-        ),
+        ("inclusion", {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0}, {"spacing_gain_max_s2", "noise_gain_max"}),
+        ("inclusion", WEIGHTED, {"alpha_at_delay"}),
+        ("inclusion", REGION, set(REGION)),
         # neither is reached however far the other one is relaxed
-        pytest.param("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}, marks=LONG),
-        pytest.param(
-            "graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}, marks=LONG
-        ),
-        pytest.param("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}, marks=LONG),
-        pytest.param(
-            "inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}, marks=LONG
-        ),
-        pytest.param(
-            "inclusion",
-            {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6), "delay_rate": 0.0},
-            {"delays_s"},
-            marks=LONG,
-        ),
-        pytest.param("graph-lqr", WEIGHTED, {"decay_rate_at_delay_1_s"}, marks=LONG),
-        pytest.param(
-            "graph-lqr",
-            {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0},
-            {"spacing_gain_max_s2", "noise_gain_max"},
-            marks=LONG,
-        ),
-        pytest.param("graph-lqr", VARYING | {"delays_s": (0.0, 3.0)}, {"delays_s"}, marks=LONG),
-        pytest.param("graph-lqr", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}, marks=LONG),
+        ("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
+        ("graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}),
+        ("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}),
+        ("inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}),
+        ("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6), "delay_rate": 0.0}, {"delays_s"}),
+        ("graph-lqr", WEIGHTED, {"decay_rate_at_delay_1_s"}),
+        ("graph-lqr", {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0}, {"spacing_gain_max_s2", "noise_gain_max"}),
+        ("graph-lqr", VARYING | {"delays_s": (0.0, 3.0)}, {"delays_s"}),
+        ("graph-lqr", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
     ],
 )
 def test_what_a_refusal_names_can_be_had(method: str, criteria: dict[str, Any], named: set[str]) -> None:

@@ -22,6 +22,7 @@ FOLLOWER = (np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [1.0, -1.
 BISECTION = 1.5e-4
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize(
     ("rate", "bound_s"), [(0.0, 6.059), (0.1, 4.703), (0.2, 3.834), (0.5, 2.420), (0.8, 2.137), (1.0, 2.128)]
 )
@@ -119,6 +120,7 @@ def test_constant_delay_is_covered_by_the_exact_margin() -> None:
     assert verdict.bound_s == delay_margin(A0, A1)
 
 
+@pytest.mark.slow(first=3)
 @pytest.mark.parametrize(
     ("jitter", "cover"),
     [

@@ -29,6 +29,7 @@ def identified(model: str) -> FlightPlan:
     return identified_in_flight(plan_for(scenario))
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("model", MODELS)
 def test_flown_onset_is_the_margin_of_the_identified_response(model: str) -> None:
     plan = identified(model)

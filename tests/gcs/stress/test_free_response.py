@@ -166,6 +166,7 @@ def test_no_commands_have_no_delay() -> None:
     assert effective_delay_s(np.empty((0, 2), dtype=np.int64), held_s=PERIOD_S) == 0.0
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize(
     "coordinates", [{"delay": 0.15, "jitter": 0.02, "loss": 0.05}, {"delay": 0.15, "loss": 0.05}, {"delay": 0.15}]
 )

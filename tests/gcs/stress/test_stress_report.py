@@ -51,6 +51,7 @@ def junit_counts(file: Path) -> dict[str, int]:
     return found
 
 
+@pytest.mark.slow(first=0)
 def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     out, junit = tmp_path / "out", tmp_path / "ci" / "junit.xml"
     options = ["--delay", "0,0.25", "--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]

@@ -28,6 +28,7 @@ def test_printed_gains_tolerate_a_second_not_the_published_0_19() -> None:
     assert delay_margin(CHAIN.A, CHAIN.B @ printed_gains()) == pytest.approx(0.077736, abs=5e-7)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("delay_s", [0.17, 0.9, 1.1])
 def test_nonlinear_flight_grows_at_the_rate_of_the_rightmost_root(delay_s: float) -> None:
     A0, A1 = late_neighbours(printed_gains(), bidirectional(CHAIN))
@@ -76,6 +77,7 @@ def test_the_sweep_needs_least_modulus_above_one_and_negative_angle() -> None:
     assert root.real == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow(first=0)
 def test_no_choice_of_late_gains_gives_the_published_margin() -> None:
     margins = errata.subset_margins()
     assert len(margins) == 4095

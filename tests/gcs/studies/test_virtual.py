@@ -14,6 +14,7 @@ from scenarios.schema import Control, FixedGains
 from tests.support.paths import SCENARIOS
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("control", [Control(), Control(for_link="measured")])
 def test_python_and_the_command_fly_the_same_bits(
     control: Control, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

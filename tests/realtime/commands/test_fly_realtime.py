@@ -49,6 +49,7 @@ def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtyp
     return np.array(delays)
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("delay_s", [0.02, 0.06])
 def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, delay_s: float) -> None:
     folder = tmp_path / "run"
@@ -261,6 +262,7 @@ def test_killed_vehicles_end_the_flight_with_the_station_saying_which(tmp_path: 
     assert "verdict  aborted: lost: all vehicles" in out
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("connected", [False, True])
 def test_gains_are_chosen_for_links_measured_just_before_the_flight(tmp_path: Path, *, connected: bool) -> None:
     up = Link(delay_s=0.15, jitter=Jitter(distribution="uniform", scale_s=0.02))

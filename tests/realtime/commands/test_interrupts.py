@@ -16,6 +16,7 @@ STRESS = ["stress", "scenarios/chain3.toml", "--delay", "0.1:0.3:3", "--workers"
 FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
 
 
+@pytest.mark.slow(first=5)
 @pytest.mark.parametrize(
     ("arguments", "module", "times", "number"),
     [
