@@ -59,16 +59,14 @@ def common_window(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float)
         tick = plant.transition(np.array([timing.common_s / timing.ticks]))
         if radius_of((tick[0] + tick[1] @ plant.K)[0]) >= 1.0:
             return assumed_s, assumed_s
-    plants = [plant for plant in plants if plant.K.any()]
-    aside_s = [continuous_crossings(plant, assumed_s)[1] if len(plants) > 1 else np.zeros(0) for plant in plants]
-    nearest_s = [(-own[own < 0.0].max(initial=-inf), own[own > 0.0].min(initial=inf)) for own in aside_s]
     shorter_s, longer_s = assumed_s, inf
-    for (below_s, above_s), plant in sorted(zip(nearest_s, plants, strict=True), key=lambda each: min(each[0])):
-        search = _Search(plant, timing, assumed_s)
-        is_far = below_s > _FAR * shorter_s + timing.common_s and above_s > _FAR * longer_s + timing.common_s
-        if not (is_far and search.is_stable_within(shorter_s, longer_s)):
-            own_s = search.ends_s()
-            shorter_s, longer_s = min(shorter_s, own_s[0]), min(longer_s, own_s[1])
+    # followers have more states than a leader, and narrower windows
+    for plant in sorted(plants, key=lambda plant: -len(plant.A)):
+        if plant.K.any():
+            search = _Search(plant, timing, assumed_s)
+            if longer_s == inf or not search.is_stable_within(shorter_s, longer_s):
+                own_s = search.ends_s()
+                shorter_s, longer_s = min(shorter_s, own_s[0]), min(longer_s, own_s[1])
     return assumed_s - shorter_s, assumed_s + longer_s
 
 
@@ -92,9 +90,11 @@ class _Search:
         self.stable = dict[float, bool]()
 
     def is_stable_within(self, shorter_s: float, longer_s: float) -> bool:
-        """Whether the loop is stable at all delays looked at up to these mismatches (s)."""
-        ends_s = np.array([-shorter_s, longer_s])
-        looks = (self.assumed_s + np.outer((*_WITHIN, 1.0), ends_s)).ravel().tolist()
+        """Whether its ends are beyond these mismatches (s): far beyond by the continuous loop, and by a few looks."""
+        aside_s = continuous_crossings(self.plant, self.assumed_s)[1]
+        if np.any((aside_s > -_FAR * shorter_s - self.common_s) & (aside_s < _FAR * longer_s + self.common_s)):
+            return False
+        looks = (self.assumed_s + np.outer((*_WITHIN, 1.0), (-shorter_s, longer_s))).ravel().tolist()
         self._judge(looks)
         return all(self.stable[look] for look in looks)
 
