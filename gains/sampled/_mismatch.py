@@ -32,9 +32,9 @@ from gains.sampled.multirate import Timing
 _FRACTIONS, _SLOW, _FEW, _AT_ONE = 4, 1.0, 4, 8
 # starting points to either side at most, and the assumed delay itself (control periods)
 _TRIED, _AT_ASSUMED = 16, 1e-9
-# Newton's method: steps, the last one (control periods) and that of a solution, and shares of angle and period for
+# Newton's method: steps, the last one of a solution (control periods), and shares of angle and period for
 # derivatives
-_STEPS, _STILL, _SOLVED, _DIFFERENCE = 12, 1e-11, 1e-9, 1e-7
+_STEPS, _SOLVED, _DIFFERENCE = 8, 1e-9, 1e-7
 # states of the largest map whose spectrum is computed, and how many kinks are looked at, times the control periods in a
 # common one
 _LARGEST_CHECK, _KINKS = 40, 600
@@ -42,8 +42,8 @@ _LARGEST_CHECK, _KINKS = 40, 600
 # look beyond is than the one before, and up to how many mismatches and common periods
 _WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
 _SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
-# how many windows of other blocks the continuous crossings of a block must be away, for a few looks to be enough
-_FAR = 1.5
+# how many windows of other blocks the continuous crossings of a block must be away, for these few looks to be enough
+_FAR, _WITHIN_FAR = 1.5, (0.5, 1.0)
 # halvings between two looks, after how many a solution is searched, from how many angles; and equal mismatches
 _HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 3, 1e-9
 
@@ -94,7 +94,7 @@ class _Search:
         aside_s = continuous_crossings(self.plant, self.assumed_s)[1]
         if np.any((aside_s > -_FAR * shorter_s - self.common_s) & (aside_s < _FAR * longer_s + self.common_s)):
             return False
-        looks = (self.assumed_s + np.outer((*_WITHIN, 1.0), (-shorter_s, longer_s))).ravel().tolist()
+        looks = (self.assumed_s + np.outer(_WITHIN_FAR, (-shorter_s, longer_s))).ravel().tolist()
         self._judge(looks)
         return all(self.stable[look] for look in looks)
 
@@ -253,7 +253,7 @@ class _Search:
         values, vectors = np.linalg.eig(self.loop.differences(self.loop.at(angle), self.loop.answers(delay_s)))
         own = np.arange(angle.size), np.argmin(np.abs(values), axis=1)
         left, right = np.linalg.pinv(vectors)[own], vectors.swapaxes(1, 2)[own][:, :, np.newaxis]
-        step_s = np.full(angle.size, inf)
+        solved_s = [np.zeros(0)]
         for _ in range(_STEPS):
             answers = self.loop.answers(np.concatenate([delay_s, delay_s + beside_s]))
             # at the place itself, at an angle beside it, and at a delay beside it
@@ -271,12 +271,12 @@ class _Search:
                 delay_step = np.clip((value * by_angle.conj()).imag / area, -self.tick_s, self.tick_s)
                 # N at -phi is the conjugate of that at phi
                 angle, delay_s = pi - np.abs(pi - np.abs(angle + angle_step) % (2.0 * pi)), delay_s + delay_step
-            kept = delay_s >= 0.0
-            angle, delay_s, left, right = angle[kept], delay_s[kept], left[kept], right[kept]
-            step_s = np.abs(delay_step[kept])
-            if not np.any(step_s > _STILL * self.tick_s):
+            solved_s.append(delay_s[(delay_s >= 0.0) & (np.abs(delay_step) < _SOLVED * self.tick_s)])
+            moving = (delay_s >= 0.0) & ~(np.abs(delay_step) < _SOLVED * self.tick_s)
+            if not moving.any():
                 break
-        return delay_s[step_s < _SOLVED * self.tick_s] - self.assumed_s
+            angle, delay_s, left, right = angle[moving], delay_s[moving], left[moving], right[moving]
+        return np.concatenate(solved_s) - self.assumed_s
 
 
 def _ranked(maps: NDArray[np.complexfloating]) -> ComplexArray:

@@ -179,25 +179,26 @@ class PredictedDifference:
 
     def turns(self, delays_s: list[float]) -> list[int]:
         """How often det(I - N) goes around 0 as z goes around the unit circle, backwards, at each true delay."""
-        found = list[int]()
-        for delay_s, (angle, values) in zip(delays_s, self.resolved(np.array(delays_s)), strict=True):
-            # from the last angle to pi the eigenvalues of I - N stay in the right half plane
-            last = self.differences(self.at(angle[-1:]), self.answers(np.array([delay_s])))[0]
-            rest = np.angle(np.linalg.eigvals(last)).sum() if angle[-1] < pi else 0.0
-            found.append(-round(float(np.angle(values[1:] / values[:-1]).sum() - rest) / pi))
-        return found
+        turned = [np.angle(values[1:] / values[:-1]).sum() for _, values in self.resolved(np.array(delays_s))]
+        last = self.grid.angle[-1:].repeat(len(delays_s))
+        if last[0] < pi:  # from there to pi the eigenvalues of I - N stay in the right half plane
+            beyond = np.linalg.eigvals(self.differences(self.at(last), self.answers(np.array(delays_s))))
+            turned -= np.angle(beyond).sum(axis=1)
+        return [-round(float(turn) / pi) for turn in turned]
 
     def resolved(self, delays_s: FloatArray) -> list[tuple[FloatArray, ComplexArray]]:
         """For each true delay, angles and det(I - N), which changes little from each angle to the next."""
         answers = self.answers(delays_s)
         found = [(self.grid.angle, self.determinants(self.grid, own)) for own in answers.each()]
+        changing = list(range(delays_s.size))
         for _ in range(_REFINEMENTS):
-            between = [_refining(*own) for own in found]
-            of = np.repeat(np.arange(delays_s.size), [own.size for own in between])
-            if of.size == 0:
+            between = {k: added for k in changing if (added := _refining(*found[k])).size}
+            changing = list(between)
+            if not changing:
                 break
-            added = self.determinants(self.at(np.concatenate(between)), answers.of(of))
-            for k in np.unique(of).tolist():
+            of = np.repeat(changing, [own.size for own in between.values()])
+            added = self.determinants(self.at(np.concatenate([*between.values()])), answers.of(of))
+            for k in changing:
                 angle = np.concatenate([found[k][0], between[k]])
                 order = np.argsort(angle)
                 found[k] = angle[order], np.concatenate([found[k][1], added[of == k]])[order]
