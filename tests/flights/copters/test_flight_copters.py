@@ -132,6 +132,7 @@ def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
     assert verdict(beyond.station.end_reason, None) == "unstable"
 
 
+@pytest.mark.slow(first=0)
 def test_the_margin_is_that_of_the_velocity_flown_where_the_air_resists() -> None:
     resisted, still = three(drag_1_m=0.06), (NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0)),)
     short = resisted.model_copy(update={"duration_s": 1.0})
