@@ -143,7 +143,7 @@ def test_an_experiment_is_read_back_as_it_was_saved(tmp_path: Path) -> None:
 
 
 def test_two_workers_fly_what_one_flies() -> None:
-    command = [sys.executable, "-m", "tests.soak", "--flights", "2", "--seed", str(SEED), "--workers"]
+    command = [sys.executable, "-m", "tests.soak", "--flights", "4", "--seed", str(SEED), "--workers"]
     told = [subprocess.run([*command, n], cwd=ROOT, capture_output=True, text=True, check=True).stdout for n in "12"]
     assert re.sub(r"in \d+ s", "", told[0]) == re.sub(r"in \d+ s", "", told[1])
-    assert "2 flights" in told[0]
+    assert "4 flights" in told[0]

@@ -1,7 +1,7 @@
 """Random loops: three independent methods agree, the margin transforms as it must, and no lower bound is above it.
 
-`RANDOM_LOOPS=1000 python3 make.py test tests/gains/margin/test_delay_opinions.py` takes a thousand; 200 are taken by
-default.
+`SLOW_TESTS=1 RANDOM_LOOPS=1000 python3 make.py test tests/gains/margin/test_delay_opinions.py` takes a thousand; 200
+are taken by default.
 """
 
 import os
@@ -79,8 +79,9 @@ def test_margin_does_not_depend_on_coordinates(part: int) -> None:
         assert delay_margin(*similar) == pytest.approx(margin_s, rel=1e-11 * np.linalg.cond(T) ** 2 + 1e-8), seed
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.timeout(900)  # some seconds each, a minute for the slowest of a thousand
-@pytest.mark.parametrize("seed", range(RANDOM_LOOPS if RANDOM_LOOPS >= 1000 else 2))
+@pytest.mark.parametrize("seed", range(RANDOM_LOOPS if RANDOM_LOOPS >= 1000 else 5))
 def test_no_lower_bound_is_above_the_margin(seed: int) -> None:
     A0, A1 = random_loop(5000 + seed)
     margin_s = delay_margin(A0, A1)
