@@ -65,8 +65,7 @@ def common_window(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float)
         if plant.K.any():
             search = _Search(plant, timing, assumed_s)
             if longer_s == inf or not search.is_stable_within(shorter_s, longer_s):
-                own_s = search.ends_s()
-                shorter_s, longer_s = min(shorter_s, own_s[0]), min(longer_s, own_s[1])
+                shorter_s, longer_s = search.ends_s(shorter_s, longer_s)
     return assumed_s - shorter_s, assumed_s + longer_s
 
 
@@ -92,16 +91,17 @@ class _Search:
     def is_stable_within(self, shorter_s: float, longer_s: float) -> bool:
         """Whether its ends are beyond these mismatches (s): far beyond by the continuous loop, and by a few looks."""
         aside_s = continuous_crossings(self.plant, self.assumed_s)[1]
-        if np.any((aside_s > -_FAR * shorter_s - self.common_s) & (aside_s < _FAR * longer_s + self.common_s)):
+        near_s = _FAR * np.array([shorter_s, longer_s]) + self.timing.held_s
+        if np.any((aside_s > -near_s[0]) & (aside_s < near_s[1])):
             return False
         looks = (self.assumed_s + np.outer(_WITHIN_FAR, (-shorter_s, longer_s))).ravel().tolist()
         self._judge(looks)
         return all(self.stable[look] for look in looks)
 
-    def ends_s(self) -> tuple[float, float]:
-        """How far (s) from the assumed delay the window ends below and above it."""
+    def ends_s(self, shorter_s: float, longer_s: float) -> tuple[float, float]:
+        """How far (s) from the assumed delay the window ends below and above it, at most so far."""
         aside_s = self._refined(*self._starts())
-        below, above = (self._looks(way, aside_s) for way in (-1.0, 1.0))
+        below, above = self._looks(-1.0, shorter_s, aside_s), self._looks(1.0, longer_s, aside_s)
         # in one go: at many small matrices, the number of calls takes the time
         self._judge(
             [
@@ -111,12 +111,12 @@ class _Search:
                 if aside_s <= own.beyond_s
             ]
         )
-        return self._end_s(-1.0, below), self._end_s(1.0, above)
+        return min(shorter_s, self._end_s(-1.0, below)), min(longer_s, self._end_s(1.0, above))
 
-    def _looks(self, way: float, aside_s: FloatArray) -> _Looks:
+    def _looks(self, way: float, longest_s: float, aside_s: FloatArray) -> _Looks:
         """Where the loop is judged below (-1) or above (1) the assumed delay, from the solutions found there."""
-        ends_s, longest_s = way * aside_s, self.assumed_s if way < 0.0 else inf
-        ends_s = np.sort(ends_s[ends_s > _AT_ASSUMED * self.tick_s])
+        ends_s = way * aside_s
+        ends_s = np.sort(ends_s[(ends_s > _AT_ASSUMED * self.tick_s) & (ends_s <= longest_s)])
         known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
         looks = [(1.0 - _BESIDE) * known_s, *self._kinks(way, max(known_s, float(ends_s.max(initial=0.0))))]
         beyond_s = inf
@@ -215,7 +215,7 @@ class _Search:
         beside_s = np.unique(np.concatenate([np.arange(-2.0 * a, 2.0 * a, b / _AT_ONE) for a, b in spans_s]))
         answers = self.loop.answers(np.maximum(0.0, self.assumed_s + beside_s))
         for real in (pi, 0.0):
-            signs = np.sign(self.loop.determinants(self.loop.at(np.full(beside_s.size, real)), answers).real)
+            signs = np.sign(np.linalg.det(self.loop.differences(self.loop.at(np.array([real])), answers).real))
             at = np.flatnonzero(signs[1:] != signs[:-1])
             angle, aside_s = np.append(angle, np.full(at.size, real)), np.append(aside_s, beside_s[at])
         angle, aside_s = (each[aside_s > -self.assumed_s] for each in (angle, aside_s))
@@ -249,10 +249,9 @@ class _Search:
         if angle.size == 0:
             return aside_s
         delay_s, beside_s = self.assumed_s + aside_s, _DIFFERENCE * self.tick_s
-        # u'(I - N)^{-1} v is large with the inverse of the eigenvalue that is to be zero, and so with no other
-        values, vectors = np.linalg.eig(self.loop.differences(self.loop.at(angle), self.loop.answers(delay_s)))
-        own = np.arange(angle.size), np.argmin(np.abs(values), axis=1)
-        left, right = np.linalg.pinv(vectors)[own], vectors.swapaxes(1, 2)[own][:, :, np.newaxis]
+        # 1 / (u'(I - N)^{-1} v) is zero where det(I - N) is; for the singular vectors u and v that is the least value
+        vectors = np.linalg.svd(self.loop.differences(self.loop.at(angle), self.loop.answers(delay_s)))
+        left, right = vectors.Vh[:, -1], vectors.U[:, :, -1:]
         solved_s = [np.zeros(0)]
         for _ in range(_STEPS):
             answers = self.loop.answers(np.concatenate([delay_s, delay_s + beside_s]))

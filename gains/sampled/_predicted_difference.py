@@ -13,6 +13,7 @@ v = N(z) v, with N = 0 where there is no mismatch. So where an eigenvalue is on 
 and the loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
 """
 
+from functools import cached_property
 from math import ceil, pi
 from typing import NamedTuple
 
@@ -93,9 +94,9 @@ class PredictedDifference:
             added.append(self.closed @ added[-1] + G @ on_v)
         self.powers, self.added = np.array(powers), np.array(added)
         self.by_assumed = self.answers(np.array([assumed_s]))
-        self.grid = self.at(self._angles())
 
-    def _angles(self) -> FloatArray:
+    @cached_property
+    def grid(self) -> Grid:
         """Angles from 0 to pi, or to where the norm of N stays below one at every true delay."""
         coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), pi * _LOW)
         delays_s = self.spread_s + np.linspace(0.0, self.common_s, max(self.ticks, 8) + 1)
@@ -104,7 +105,7 @@ class PredictedDifference:
         bound = 2.0 * (of_first * np.linalg.norm(self._first(coarse), axis=(1, 2)) + of_v)
         last = coarse[min(np.flatnonzero(bound > _SMALL).max(initial=0) + 1, coarse.size - 1)]
         turns = last * (_LONGEST * self.assumed_s / self.common_s + 1.0) / _TURN
-        return np.union1d(np.linspace(0.0, last, max(int(turns), _ANGLES)), last * _LOW)
+        return self.at(np.union1d(np.linspace(0.0, last, max(int(turns), _ANGLES)), last * _LOW))
 
     def _first(self, angle: FloatArray) -> ComplexArray:
         free = np.exp(1j * angle)[:, np.newaxis, np.newaxis] * np.eye(len(self.closed)) - self.powers[-1]
@@ -123,10 +124,10 @@ class PredictedDifference:
         flow, hold = (maps.reshape(*rest_s.shape, *maps.shape[1:]) for maps in self.plant.transition(rest_s.ravel()))
         periods, k = np.divmod(behind.astype(np.int64), self.ticks)
         flow = flow + hold @ self.plant.K
-        seen = self.counted[:, np.newaxis]
-        of_first = seen @ (flow @ self.powers[k])[:, self.sample]
-        of_v = seen @ (flow @ self.added[k] + hold @ self.on_v[k])[:, self.sample]
-        return Answers(periods[:, self.sample].astype(np.float64), of_first[:, :, 0], of_v[:, :, 0])
+        periods, k, flow, hold = (part[:, self.sample] for part in (periods, k, flow, hold))
+        flow, hold = (self.counted[:, np.newaxis] @ part for part in (flow, hold))
+        of_first, of_v = flow @ self.powers[k], flow @ self.added[k] + hold @ self.on_v[k]
+        return Answers(periods.astype(np.float64), of_first[:, :, 0], of_v[:, :, 0])
 
     def seen_at(self, grid: Grid, answers: Answers) -> ComplexArray:
         """What the samples see of v through the commands, (k, m, m), with one true delay or k of them."""
