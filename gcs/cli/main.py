@@ -66,7 +66,7 @@ def main() -> None:
     except (InputError, ScenarioError, GainsError, KeyFileError) as error:
         code = _bad_input(str(error))
     except typer.TyperException as error:  # an unknown option, a missing argument
-        code = _bad_input(error.format_message() if isinstance(error, typer.BadParameter) else str(error))
+        code = _bad_input(_misread(error) if isinstance(error, typer.BadParameter) else str(error))
     except ModuleNotFoundError as error:
         if not extra_wanted(error.name):
             raise
@@ -83,6 +83,18 @@ def main() -> None:
         code = _bad_input(f"{error.filename or 'write'}: {error.strerror}, wanted a file or folder that can be used")
     gc.freeze()  # the interpreter would look for garbage once more as it ends: a tenth of a second
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _misread(error: typer.BadParameter) -> str:
+    """What was read and what was wanted, where a value is of the wrong kind."""
+    from pydantic import ValidationError
+
+    if error.param is None or not isinstance(error.__cause__, ValidationError):
+        return error.format_message()
+    [found, *_] = error.__cause__.errors()
+    option = error.param.get_error_hint().replace("'", "")
+    wanted = found["msg"].removeprefix("Input should be ").split(", unable to")[0].split("is not ")[-1].rstrip(".")
+    return f"{option}: read {found['input']!r}, wanted {wanted}"
 
 
 def _bad_input(line: str) -> int:

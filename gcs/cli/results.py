@@ -243,7 +243,7 @@ def print_benchmark(result: Benchmark) -> None:
         )
     if not result.compiled:
         first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
-        print(f"twice as fast:  {first}python3 make.py compile")
+        print(f"compiled        about a quarter faster: {first}python3 make.py compile")
 
 
 def print_peers(found: SideBySide) -> None:
