@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 
+from scenarios.keys.criteria import Criteria
 from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
 
 _AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
 _MEASURED = "at_delay_s", "delays_s", "delay_rate"
+_WITHOUT_DELAY = "damping_min", "natural_frequency_max_rad_s"
 
 
 def contradictions(scenario: Scenario) -> Iterator[Fault]:
@@ -28,8 +30,7 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if control.loop == "onboard":
         yield "control.loop", control.loop, "ground, with control.criteria"
     if scenario.dynamics != "double_integrator":
-        wanted = f"no such key with dynamics {scenario.dynamics}: it is for vehicles that respond at once"
-        yield "control.criteria", "requirements", wanted
+        yield from _late_contradictions(scenario, criteria)
     if control.prediction != "off":
         yield "control.criteria", "requirements", "no such key with prediction"
     low, high = criteria.delays_s or (0.0, 0.0)
@@ -46,6 +47,16 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
         yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"
 
 
+def _late_contradictions(scenario: Scenario, criteria: Criteria) -> Iterator[Fault]:
+    """Criteria of vehicles that do not respond at once."""
+    whose, wanted = f"with dynamics {scenario.dynamics}", "it is for vehicles that respond at once"
+    if scenario.control.for_link == "off":
+        yield "control.criteria", "requirements", f"no such key {whose} and without for_link: {wanted}"
+    for name in _WITHOUT_DELAY:
+        if value := getattr(criteria, name):
+            yield f"control.criteria.{name}", value, f"no such key {whose}: {wanted}"
+
+
 def _for_link_contradictions(scenario: Scenario) -> Iterator[Fault]:
     control, key = scenario.control, "control.for_link"
     if control.for_link == "off":
@@ -57,9 +68,8 @@ def _for_link_contradictions(scenario: Scenario) -> Iterator[Fault]:
         yield key, control.for_link, "off, unless method is inclusion and loop is ground"
     if control.prediction != "off":
         yield key, control.for_link, "off, with prediction: it is chosen together with the gains"
-    if scenario.dynamics == "autopilot" or scenario.response is not None:
-        whose = "dynamics autopilot" if scenario.dynamics == "autopilot" else "a [response]"
-        yield key, control.for_link, f"off, with {whose}: gains for a link are those of vehicles that respond at once"
+    if scenario.dynamics != "double_integrator" and scenario.response is None:
+        yield key, control.for_link, f"off, with dynamics {scenario.dynamics} and no [response] (gcs identify)"
     if control.criteria is None:
         return
     for name in _MEASURED:

@@ -163,7 +163,7 @@ class Control(Part):
     for_link: Literal["off", "measured"] = "off"
     """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that `gcs fly`
     measures before the flight, or that a log shows (`--links-of`). `criteria` and `string_peak_max` hold at their
-    delays."""
+    delays. With `dynamics = "autopilot"` the file must give the `response`."""
     link_headroom: Annotated[float, Field(ge=0, lt=1)] = 0.3
     """With `for_link`: the headroom to keep at the worst delay of the measured links."""
 

@@ -29,7 +29,7 @@ class LoopFigures:
 
     Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` is
     that of spacing errors and of velocity errors, see `gains.core.requirement.Criteria`. Where errors run down a chain
-    of equal followers, `chain` is one of them. Figures without delay do not include a response.
+    of equal followers, `chain` is one of them. Figures without delay do not include a response, but `string_peak` does.
 
     >>> lone = LoopFigures(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.inf, 0.02), 0.29)
     >>> round(lone.decay_rate_1_s, 6), round(lone.decay_rate_at_delay_1_s, 3), round(lone.alpha_at_delay, 3)
@@ -147,7 +147,8 @@ class LoopFigures:
         `rate` 0: constant but not known, exact. Any other: proved by `gains.varying.jitter.spread_bound`, in a search
         estimated. 0 if the loop is unstable at the mean.
         """
-        A, late = self.model.A, self.model.B @ self.K
+        A, B, K = formation_loop(self.model, self.K, self.responses)
+        late = B @ K
         middle_s = mean_s + self.timing.period_s / 2.0
         if rate > 0.0:
             # with several inputs the scaling takes minutes

@@ -80,7 +80,7 @@ class PredictedFigures:
     Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles answer at once if they have no
     `response`. `chain` says that the model is a vehicle and its follower of a chain of equal ones. `feed_forward` is
     k_ff, which is not part of K. `thinned` is as of `LoopFigures`, and the window of a search that of the continuous
-    loop, unless the delay is short; a search is of vehicles without a response.
+    loop, unless the delay is short.
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
@@ -164,7 +164,8 @@ class PredictedFigures:
         def decay(delay_s: float) -> float:
             if self.decay_rate_1_s <= 0.0:
                 return self.decay_rate_1_s
-            if delay_s == self.assumed_s and self.response is None:  # the loop behind the delay is that without
+            # the loop behind the delay is that without; an error of a computed response decays as that does
+            if delay_s == self.assumed_s and (self.response is None or self.thinned > 1):
                 Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
                 return -rate_of(radius_of(Phi + G @ K), self.period_s)
             if self.thinned == 1:

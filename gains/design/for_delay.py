@@ -118,12 +118,13 @@ def longest_static_delay(
     return least_s, found or ScalarGains(0.0, 0.0, 0.0, 0.0)
 
 
-def criteria_gains(wanted: Requirement, period_s: float) -> ScalarGains:
+def criteria_gains(wanted: Requirement, period_s: float, response: Response | None = None) -> ScalarGains:
     """Return the gains of the inclusion principle that meet a requirement with criteria and are best in its objective.
 
-    They are the same for every vehicle of a leader-follower tree of any size. Commands are held for `period_s`, which
-    counts as half a period of delay. The α of the result is that at the delay. BadModelError if the period is not
-    positive; InfeasibleError if no gains were found, with how far each part alone would have to be relaxed.
+    They are the same for every vehicle of a leader-follower tree of any size; each has the `response`, or responds at
+    once. Commands are held for `period_s`, which counts as half a period of delay. The α of the result is that at the
+    delay. BadModelError if the period is not positive; InfeasibleError if no gains were found, with how far each part
+    alone would have to be relaxed.
 
     Fastest decay at 0.3 s and 50 Hz:
 
@@ -136,7 +137,7 @@ def criteria_gains(wanted: Requirement, period_s: float) -> ScalarGains:
     criteria = wanted.criteria
     assert criteria is not None
     timing = FlownTiming(inf, positive_seconds("period_s", period_s))
-    tree = TreeGains(criteria.at_delay_s, timing, criteria.weight, criteria.discrete)
+    tree = TreeGains(criteria.at_delay_s, timing, criteria.weight, criteria.discrete, response)
     point, figures = searched(tree, wanted)
     return replace(tree.gains(point), alpha=figures.alpha_at_delay)
 
@@ -165,18 +166,23 @@ def _late_s(delay_s: float | None, timing: FlownTiming) -> float:
 
 @dataclass(frozen=True)
 class TreeGains:
-    """k1, k2 and k3 of a vehicle behind another; a point is (ln k1 late, k2 / k1, ln k3 / k1²)."""
+    """k1, k2 and k3 of a vehicle behind another; a point is (ln k1 late, k2 / k1, ln k3 / k1²).
+
+    Vehicles respond at once if they have no `response`.
+    """
 
     delay_s: float | None
     timing: FlownTiming
     weight: tuple[float, float] | None = None
     discrete: bool = False
+    response: Response | None = None
     step: float = 0.3
 
     @property
     def late_s(self) -> float:
-        """The delay with half a hold."""
-        return _late_s(self.delay_s, self.timing)
+        """The delay with half a hold, and about what the response adds."""
+        slow_s = 0.0 if self.response is None else self.response.lag_s + self.response.dead_time_s
+        return _late_s(self.delay_s, self.timing) + slow_s
 
     @property
     def starts(self) -> Sequence[FloatArray]:
@@ -191,9 +197,16 @@ class TreeGains:
 
     def figures(self, point: FloatArray) -> LoopFigures:
         gains = self.gains(point)
-        chain = FlownLoop(gains, self.timing)
         return LoopFigures(
-            PAIR, gains.K, self.timing, self.delay_s, self.weight, chain=chain, discrete=self.discrete, thinned=_THINNED
+            PAIR,
+            gains.K,
+            self.timing,
+            self.delay_s,
+            self.weight,
+            None if self.response is None else (self.response, self.response),
+            FlownLoop(gains, self.timing, self.response),
+            self.discrete,
+            _THINNED,
         )
 
 

@@ -25,12 +25,15 @@ from gains.design.predicted import PredictedPattern, PredictedTree
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern
 from gains.performance.flown import FlownTiming
+from gains.performance.response import Response
 
 Method = Literal["inclusion", "graph-lqr"]
 Aim = Literal["alpha_at_delay", "decay_rate_at_delay_1_s"]
 AIMS: tuple[Aim, Aim] = "alpha_at_delay", "decay_rate_at_delay_1_s"
 # gains that a search compares; α is within about 2 % of that of a search three times as long
 _EVALUATIONS: dict[Method, int] = {"inclusion": 120, "graph-lqr": 40}
+# by inclusion with a response, where the best decay has more roots side by side
+_EVALUATIONS_RESPONSE = 300
 # a point that is worse by no more than this share is not worse
 _ALIKE = 1e-3
 
@@ -76,20 +79,25 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrontSearch:
-    """What a front is made of. `tolerated` is the share by which the delay may differ from that designed for."""
+    """What a front is made of. `tolerated` is the share by which the delay may differ from that designed for.
+
+    With a `response`, which then is that of every vehicle, it is made of gains by inclusion only.
+    """
 
     formation: FormationModel
     pattern: Pattern
     period_s: float
     tolerated: float = 0.2
     string_peak_max: float | None = 1.0
+    response: Response | None = None
 
     def point(self, at: tuple[Route, float]) -> FrontPoint | Refusal:
         """The point of a route at a loop delay (s)."""
         route, delay_s = at
         family = self._family(route, delay_s)
+        evaluations = _EVALUATIONS[route.method] if self.response is None else _EVALUATIONS_RESPONSE
         try:
-            point, found = searched(family, self.wanted(route, delay_s), evaluations=_EVALUATIONS[route.method])
+            point, found = searched(family, self.wanted(route, delay_s), evaluations=evaluations)
         except GainsError as error:
             return Refusal(route, delay_s, str(error))
         return self._point(route, delay_s, family, point, found)
@@ -111,8 +119,8 @@ class FrontSearch:
             gains = replace(self._graph, delay_s=delay_s, timing=timing)
             return PredictedPattern(gains) if route.predicted else gains
         if route.predicted:
-            return PredictedTree(delay_s, self.period_s, tolerated=self.tolerated)
-        return TreeGains(delay_s, timing)
+            return PredictedTree(delay_s, self.period_s, tolerated=self.tolerated, response=self.response)
+        return TreeGains(delay_s, timing, response=self.response)
 
     def _point(self, route: Route, delay_s: float, family: GainFamily, point: FloatArray, found: Figures) -> FrontPoint:
         single = FormationModel(self.formation.predecessors, axes=1)
@@ -136,8 +144,9 @@ class FrontSearch:
     ) -> LoopFigures | PredictedFigures:
         """All figures of gains at a delay."""
         if predicted:
-            return PredictedFigures(single, K, self.period_s, delay_s, (delay_s,))
-        return LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s)
+            return PredictedFigures(single, K, self.period_s, delay_s, (delay_s,), response=self.response)
+        every = None if self.response is None else (self.response,) * single.vehicles
+        return LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s, responses=every)
 
 
 def _gain(family: GainFamily, point: FloatArray, single: FormationModel) -> FloatArray:

@@ -22,8 +22,8 @@ from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
 
 _THINNED, _THINNED_PATTERN = 4, 10
-# gains that a search compares
-_EVALUATIONS = 160
+# gains that a search compares, at once and with a response
+_EVALUATIONS, _EVALUATIONS_RESPONSE = 160, 400
 # mismatch for which a search begins where none is asked for, as a share of the assumed delay
 _TOLERATED = 0.2
 # time scales from which gains on a pattern are started, as multiples of the assumed delay
@@ -71,12 +71,14 @@ def longest_assumed_s(
     return most_s if ends[1][1] >= 0.0 else exp(met_end(spare, *ends, resolution=_CLOSE))
 
 
-def predicted_gains(wanted: Requirement, period_s: float, at_s: Sequence[float] | None = None) -> ScalarGains:
+def predicted_gains(
+    wanted: Requirement, period_s: float, at_s: Sequence[float] | None = None, response: Response | None = None
+) -> ScalarGains:
     """Return the gains of the inclusion principle that meet a requirement with prediction and are best in its aim.
 
     `wanted.criteria` has the assumed delay. Figures at a delay are the worst at the true delays `at_s`, of the loop
-    without mismatch if None. The α of the result is that at these delays. Raises InfeasibleError as `best_at_delay`
-    does.
+    without mismatch if None. Vehicles respond at once if they have no `response`. The α of the result is that at these
+    delays. Raises InfeasibleError as `searched` does.
 
     With 20 % of mismatch to either side of 0.6 s, errors decay at 2.5 1/s; without prediction at 0.96 1/s at best:
 
@@ -86,10 +88,12 @@ def predicted_gains(wanted: Requirement, period_s: float, at_s: Sequence[float] 
     >>> round(found.k1, 1), round(found.k3, 1)
     (5.0, 6.5)
     """
-    assert wanted.criteria is not None
-    assert wanted.criteria.at_delay_s is not None
-    family = PredictedTree(wanted.criteria.at_delay_s, period_s, at_s, wanted.criteria.weight, _tolerated(wanted))
-    point, figures = searched(family, wanted, evaluations=_EVALUATIONS)
+    criteria = wanted.criteria
+    assert criteria is not None
+    assert criteria.at_delay_s is not None
+    family = PredictedTree(criteria.at_delay_s, period_s, at_s, criteria.weight, _tolerated(wanted), response)
+    evaluations = _EVALUATIONS if response is None else _EVALUATIONS_RESPONSE
+    point, figures = searched(family, wanted, evaluations=evaluations)
     return replace(family.tree.gains(point), alpha=figures.alpha_at_delay)
 
 
@@ -110,12 +114,13 @@ class PredictedTree:
     at_s: Sequence[float] | None = None
     weight: tuple[float, float] | None = None
     tolerated: float = _TOLERATED
+    response: Response | None = None
     step: float = 0.2
 
     @property
     def tree(self) -> TreeGains:
         """The same gains without prediction."""
-        return TreeGains(self.assumed_s, FlownTiming(inf, self.period_s))
+        return TreeGains(self.assumed_s, FlownTiming(inf, self.period_s), response=self.response)
 
     @property
     def starts(self) -> Sequence[FloatArray]:
@@ -130,7 +135,9 @@ class PredictedTree:
     def figures(self, point: FloatArray) -> PredictedFigures:
         """The figures of the gains of a point."""
         K, at_s = self.tree.gains(point).K, (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
-        return PredictedFigures(PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED)
+        return PredictedFigures(
+            PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED, self.response
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,7 +110,8 @@ def show_front(scenario: "Scenario", method: str | None, picture_file: Path | No
         out_file("--picture", picture_file)
         if picture_file.suffix not in {".svg", ".png", ".pdf"}:
             raise InputError(f"--picture: read {picture_file}, wanted a file name that ends in .svg, .png or .pdf")
-    methods: Sequence[Method] = [own for own in METHODS if method in (None, own)]
+    wanted = method or ("inclusion" if scenario.response is not None else None)
+    methods: Sequence[Method] = [own for own in METHODS if wanted in (None, own)]
     with progress(shown=not as_json) as begin:
         found = front(scenario, methods, DELAYS_S, workers=os.cpu_count() or 1, ended=begin("front"))
     if picture_file is not None:

@@ -137,13 +137,15 @@ def onboard_timing(scenario: Scenario) -> OnboardTiming | None:
     )
 
 
+def given_response(scenario: Scenario) -> Response | None:
+    """The scenario's response, which all its vehicles have."""
+    return None if scenario.response is None else Response(**scenario.response.model_dump())
+
+
 def given_responses(scenario: Scenario) -> Responses | None:
-    """The scenario's response, as that of each of its vehicles."""
-    given = scenario.response
-    if given is None:
-        return None
-    response = Response(**given.model_dump())
-    return Responses("given", {vehicle.system_id: response for vehicle in scenario.vehicles})
+    """The same, as that of each of the vehicles."""
+    given = given_response(scenario)
+    return None if given is None else Responses("given", {own.system_id: given for own in scenario.vehicles})
 
 
 def at_once(steps: Generator[None, None, Found]) -> Found:

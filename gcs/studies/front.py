@@ -21,7 +21,7 @@ from gains.design.predicted import least_gains, longest_assumed_s
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
 from gcs.plan.design import Design, GainsAtDelay
-from gcs.plan.flight_plan import loop_timing
+from gcs.plan.flight_plan import given_response, loop_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
 from gcs.plan.planner import pattern_of
@@ -76,7 +76,7 @@ def front(
 
     Raises InputError where a front is not defined.
     """
-    search, routes = searched_in(scenario), list(product_of(methods, (False, True), AIMS))
+    search, routes = searched_in(scenario, methods), list(product_of(methods, (False, True), AIMS))
     left, found = len(routes) * len(delays_s), list[FrontPoint | Refusal]()
     with local_workers(workers, search.point) as each:
         for one in each([(route, delay_s) for delay_s in delays_s for route in routes]):
@@ -99,16 +99,16 @@ def product_of(methods: Sequence[Method], predicted: Sequence[bool], aims: Seque
     return (Route(*each) for each in product(methods, predicted, aims))
 
 
-def searched_in(scenario: Scenario) -> FrontSearch:
-    """The search of a scenario's formation. Raises InputError where a front is not defined."""
-    for read, given in (
-        ("dynamics autopilot", scenario.dynamics == "autopilot"),
-        ("a [response]", scenario.response is not None),
-        ("loop onboard", scenario.control.loop == "onboard"),
+def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
+    """The search of a scenario's formation by these methods. Raises InputError where a front is not defined."""
+    response, dynamics = given_response(scenario), scenario.dynamics
+    for read, given, wanted in (
+        ("loop onboard", scenario.control.loop == "onboard", "loop ground"),
+        (f"dynamics {dynamics}", dynamics != "double_integrator" and response is None, "a [response] (gcs identify)"),
+        ("graph-lqr and a [response]", response is not None and "graph-lqr" in methods, "--method inclusion"),
     ):
         if given:
-            wanted = "vehicles that respond at once and loop ground, with --front or --at"
-            raise InputError(f"{scenario.name}: read {read}, wanted {wanted}")
+            raise InputError(f"{scenario.name}: read {read}, wanted {wanted}, with --front or --at")
     if len(scenario.vehicles) > MOST_VEHICLES:
         wanted = f"at most {MOST_VEHICLES} with --front or --at; gains by inclusion are those of a smaller formation"
         raise InputError(f"{scenario.name}: read {len(scenario.vehicles)} vehicles, wanted {wanted}")
@@ -119,6 +119,7 @@ def searched_in(scenario: Scenario) -> FrontSearch:
         pattern_of(cleared, formation),
         loop_timing(scenario).held_s,
         string_peak_max=scenario.control.string_peak_max,
+        response=response,
     )
 
 
@@ -130,7 +131,7 @@ def point_at(
     Raises InputError if no gains take the delay.
     """
     predicted = (False, True) if prediction is None else (prediction == "on",)
-    search = searched_in(scenario)
+    search = searched_in(scenario, (method,))
     found = [search.point((route, delay_s)) for route in product_of((method,), predicted, (aim,))]
     points = [own for own in found if isinstance(own, FrontPoint)]
     if not points:

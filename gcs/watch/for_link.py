@@ -24,7 +24,7 @@ from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
 from gcs.plan.design import GainsAtDelay, LinkPart
 from gcs.plan.expected_delay import drawn_loop_delays_s
-from gcs.plan.flight_plan import loop_timing
+from gcs.plan.flight_plan import given_response, loop_timing
 from gcs.plan.given import with_given
 from gcs.watch.rebuild_report import found
 from gcs.watch.saved_links import LinkRecorder, recorded
@@ -136,7 +136,7 @@ def _name(own: GainsAtDelay) -> str:
 
 def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> GainsAtDelay:
     """The best gains with or without prediction, and their figures."""
-    control, period_s = scenario.control, loop_timing(scenario).held_s
+    control, period_s, response = scenario.control, loop_timing(scenario).held_s, given_response(scenario)
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
     middle_s, worst_s, spare = delays.median_s, delays.worst_s, 1.0 - control.link_headroom
     around_s = max(worst_s - middle_s, middle_s - delays.least_s)
@@ -152,10 +152,13 @@ def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicte
     try:
         margin_s = None if predicted else worst_s / spare
         wanted = Requirement(margin_s, string_peak_max=control.string_peak_max, criteria=criteria)
-        gains = predicted_gains(wanted, period_s, ends_s) if predicted else criteria_gains(wanted, period_s)
+        if predicted:
+            gains = predicted_gains(wanted, period_s, ends_s, response)
+        else:
+            gains = criteria_gains(wanted, period_s, response)
     except GainsError as error:
         return GainsAtDelay(prediction=predicted, refused=str(error))
-    return evaluated(gains, period_s, middle_s if predicted else None, ends_s)
+    return evaluated(gains, period_s, middle_s if predicted else None, ends_s, response)
 
 
 def evaluated(

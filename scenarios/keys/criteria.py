@@ -19,7 +19,7 @@ class Overlap(Part):
 
 
 class Criteria(Part):
-    """Further requirements of the gains, for `loop = "ground"` and vehicles that respond at once.
+    """Further requirements of the gains, for `loop = "ground"` and vehicles that respond at once, or with `for_link`.
 
     Gains are then searched, at `at_delay_s` if that is given. A requirement is met, or refused with how far each part
     alone would have to be relaxed.

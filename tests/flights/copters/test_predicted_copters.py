@@ -2,17 +2,21 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import pytest
 
+from gains.design.front import AIMS, Aim
+from gains.performance.response import formation_loop
 from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.studies.front import compared
+from gcs.studies.front import compared, point_at
+from gcs.watch.for_link import MeasuredDelays, best_for
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
 from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
@@ -84,6 +88,36 @@ def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
     assert plain_1_s == pytest.approx(wanted_1_s, rel=0.02)
     assert known(ways[0].string_peak) > 1.3
     assert {way.string_peak for way in ways[1:]} == {1.0}
+
+
+@pytest.mark.slow(first=2)
+@pytest.mark.parametrize("aim", AIMS)
+@pytest.mark.parametrize("prediction", ["on", "off"])
+def test_gains_for_a_delay_decay_in_flight_as_computed(aim: Aim, prediction: Literal["on", "off"]) -> None:
+    chosen, point = point_at(scenario("off", 0.3), 0.6, "inclusion", aim, prediction)
+    flown_1_s, flown_s = small_decay_1_s(flight_plan(chosen)[1], 0.5888)
+    assert flown_s == pytest.approx(0.6, abs=0.0002)
+    assert flown_1_s == pytest.approx(known(point.decay_rate_1_s), rel=0.003)
+
+
+def test_copters_take_the_gains_for_their_measured_link() -> None:
+    asked = scenario("off", 0.2).model_copy(update={"control": Control(for_link="measured", link_headroom=0.3)})
+    chosen, why = best_for(asked, MeasuredDelays("a link", (1, 2, 3), 0.39, 0.41, 0.43))
+    plain, predicted = why.candidates
+    assert chosen.control.prediction == "measured"
+    assert known(predicted.alpha) > 1.3 * known(plain.alpha)
+    plan = flight_plan(chosen)[1]
+    assert not plan.tolerance(0.41).longer_s[0] < 0.02 / 0.7
+    # as the whole map of these vehicles tells
+    assert predicted.stable_s is not None
+    least_s, most_s = predicted.stable_s[0], known(predicted.stable_s[1])
+    loop = formation_loop(plan.model, plan.gain, plan.responses_in_order)
+    measured = [state < plan.model.states for state in range(len(loop[0]))]
+    for end_s, outwards in ((least_s, -0.001), (most_s, 0.001)):
+        for sign in (-1.0, 1.0):
+            late_s = end_s * (1.0 + sign * outwards)
+            growth_1_s = predicted_growth_rate(*loop, plan.timing, assumed_s=0.41, delay_s=late_s, measured=measured)
+            assert sign * growth_1_s > 0.0
 
 
 def test_without_prediction_the_same_copters_drift_apart() -> None:

@@ -22,7 +22,7 @@ from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, load
 from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
-from scenarios.schema import Control, Response, Scenario
+from scenarios.schema import Control, Criteria, Response, Scenario
 from tests.support.fleets.logged_flight import flown, log_bytes
 from tests.support.fleets.own_code import coded
 from tests.support.known import known
@@ -136,12 +136,20 @@ def test_a_scenario_for_measured_links_is_not_designed_without_them() -> None:
         checked(CHAIN.model_copy(update={"control": control}), Path("chain3.toml"))
 
 
-def test_gains_for_a_link_are_refused_to_vehicles_that_do_not_respond_at_once() -> None:
-    late = coded(dynamics="lagged").model_copy(update={"response": Response(lag_s=0.2), "control": Control()})
-    with pytest.raises(InputError, match=r"read a \[response\], wanted vehicles that respond at once"):
-        searched_in(late)
-    with pytest.raises(ScenarioError, match=r"for_link: read 'measured', wanted off, with a \[response\]"):
-        checked(late.model_copy(update={"control": Control(for_link="measured")}), Path("own.toml"))
+def test_gains_for_a_link_are_refused_to_vehicles_of_unknown_response() -> None:
+    late = coded(dynamics="lagged").model_copy(update={"control": Control()})
+    with pytest.raises(InputError, match=r"read dynamics own.py:lagged, wanted a \[response\] \(gcs identify\)"):
+        searched_in(late, ("inclusion",))
+    for_link = late.model_copy(update={"control": Control(for_link="measured")})
+    with pytest.raises(ScenarioError, match=r"for_link: read 'measured', wanted off, with dynamics own.py"):
+        checked(for_link, Path("own.toml"))
+    known = {"response": Response(lag_s=0.2)}
+    with pytest.raises(InputError, match=r"read graph-lqr and a \[response\], wanted --method inclusion"):
+        searched_in(late.model_copy(update=known), ("inclusion", "graph-lqr"))
+    checked(for_link.model_copy(update=known), Path("own.toml"))
+    damped = Control(for_link="measured", criteria=Criteria(maximise="decay_rate_1_s", damping_min=0.7))
+    with pytest.raises(ScenarioError, match=r"damping_min: read 0.7, wanted no such key with dynamics own.py:lagged"):
+        checked(for_link.model_copy(update=known | {"control": damped}), Path("own.toml"))
 
 
 def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> None:
