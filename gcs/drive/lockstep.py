@@ -8,6 +8,7 @@ a socket; the station decides nothing in between.
 import gc
 from collections import Counter
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Protocol
 
@@ -29,6 +30,9 @@ START_NS = 1_000_000_000
 EPOCH_NS = 1_800_000_000 * 1_000_000_000
 """Virtual time 0 of a signed flight, in ns since 1970."""
 _HOST = "virtual"
+_FLIGHTS_COLLECTED = 100
+"""Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
+_flights = count(1)
 
 Sent = list[tuple[int, bytes, int]]
 """Datagrams as (system id, bytes, time in ns)."""
@@ -110,6 +114,8 @@ def fly_lockstep(
         yield from _ticks(plan, station, vehicles, guard)
     finally:
         gc.unfreeze()
+        if next(_flights) % _FLIGHTS_COLLECTED == 0:
+            gc.collect()
 
 
 def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:

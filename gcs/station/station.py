@@ -15,9 +15,9 @@ from gcs.control.law import VehicleControl, distances_m
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Order
-from gcs.control.own_law import LAW, LawHooks
+from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Event, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
@@ -27,6 +27,7 @@ from gcs.plan.mismatch import Tolerated
 from gcs.station.absence import absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
+from gcs.station.journal import Journal
 from gcs.station.monitor import FormationMonitor
 from gcs.station.tick_rows import Reported, Tick, tick_rows
 from scenarios.schema import NS_PER_S
@@ -53,11 +54,12 @@ class Station:
         self.plan = plan
         self.phase = Phase.CONNECTING
         self.end_reason = ""
-        self.events: list[Event] = []
+        self._journal = journal = Journal(start_ns, patience_s(scenario))
+        self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
         self.frames: list[tuple[bytes, int]] = []
         """Frames received since the driver last took them, each with the time at which it was received."""
         self.counters: Counter[str] = Counter()
-        self._fleet = fleet_of(plan, self._report, LawHooks(self.request_stop, self._note_law, stopwatch_ns))
+        self._fleet = fleet_of(plan, journal.report, LawHooks(journal.request_stop, journal.note_law, stopwatch_ns))
         self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
@@ -71,11 +73,9 @@ class Station:
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
-        self.patience_s = patience_s(scenario)
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
-        self._flight_start_ns: int | None = None
         self._next_tick_ns = start_ns
         self._next_heartbeat_ns = start_ns
         # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
@@ -85,7 +85,6 @@ class Station:
         self._requests_apart_ns = min(self._period_ns // 3, _REQUESTS_APART_NS)
         self._timesync_row = 0
         self._tick_count = 0
-        self._stop = ""
         self._now_ns = start_ns
         self._reported = [Reported()] * n
         self._repetitions = Repetitions(rates, n)
@@ -104,7 +103,7 @@ class Station:
 
     def request_stop(self, reason: str) -> None:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
-        self._stop = self._stop or reason
+        self._journal.request_stop(reason)
 
     def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
         """Take datagrams in and do what is due.
@@ -114,7 +113,7 @@ class Station:
         datagrams to send, and the control tick if one was due. The driver passes the tick to `complete` once the
         datagrams are sent.
         """
-        self._now_ns = now_ns
+        self._now_ns = self._journal.now_ns = now_ns
         outgoing: list[Outgoing] = []
         for datagram in datagrams:
             self._receive(datagram, outgoing)
@@ -135,12 +134,6 @@ class Station:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom."""
         rows, self._used_s = tick_rows(tick, sent_ns)
         return rows
-
-    def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that, the time since the start minus `patience_s`: negative."""
-        if self._flight_start_ns is None:
-            return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
-        return (now_ns - self._flight_start_ns) / NS_PER_S
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
         """Whether a frame claims the system id of a vehicle that is known to send from another address."""
@@ -375,23 +368,23 @@ class Station:
         phase = next_phase(
             self.phase,
             all_ready=all_ready,
-            stop=bool(self._stop),
+            stop=bool(self._journal.stop),
             all_holding=all(v.ended for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
             identified=self._fleet.identified,
         )
         if phase is self.phase:
             return
-        if self.phase is Phase.CONNECTING and not self._stop:
+        if self.phase is Phase.CONNECTING and not self._journal.stop:
             self._fleet.begin()
         self.phase, self._phase_since_ns = phase, due_ns
         if phase is Phase.FLYING:
-            self._flight_start_ns = due_ns
+            self._journal.flight_start_ns = due_ns
         if phase is Phase.ENDING:
-            self.end_reason = self._stop
+            self.end_reason = self._journal.stop
             self._fleet.end()
             # A broken formation is left to its failsafe, if that holds the vehicles: what broke may be the link.
-            alone = self._stop.startswith("broken") and self._fleet.holds_when_left_alone
+            alone = self._journal.stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
                 vehicle.goal = None if alone else Goal.END
         self._report("phase", str(phase))
@@ -419,9 +412,3 @@ class Station:
             return
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
-
-    def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
-        self.events.append(Event(time_s=self.scenario_time_s(self._now_ns), kind=kind, text=text, system_id=system_id))
-
-    def _note_law(self, text: str, counts: dict[str, int] | None) -> None:
-        self.events.append(Event(time_s=self.scenario_time_s(self._now_ns), kind=LAW, text=text, counts=counts))

@@ -8,6 +8,7 @@ in virtual time it is then the same to the last bit, with files and a Rerun reco
 import contextlib
 import ctypes
 import fcntl
+import hashlib
 import json
 import os
 import signal
@@ -31,6 +32,8 @@ from gcs.stress.trial import Outcome, Trial
 TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"
 _PR_SET_PDEATHSIG = 1
+_TRIALS_IN_TASK, _TASKS_OF_THREAD = 16, 4
+"""Trials that Dask sends as one task, at most, and the tasks that each of its threads gets, at least."""
 _Record = TypeVar("_Record")
 
 Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
@@ -211,18 +214,27 @@ def dask_workers(address: str, run: Callable[[Trial], Outcome] = fly_trial) -> G
     except ImportError:
         raise InputError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
     try:
-        client = Client(address, timeout=10)
+        client: Any = Client(address, timeout=10)
     except (OSError, ValueError) as error:
         raise InputError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
 
     def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
-        # the id as key: a scheduler that still has the result for an earlier client returns it without a flight
-        futures = [client.submit(run, trial, key=f"trial-{trial.id}", pure=True) for trial in trials]
-        for _, outcome in dask_as_completed(futures, with_results=True):
-            yield outcome
+        threads = sum(client.nthreads().values())
+        in_task = min(_TRIALS_IN_TASK, max(1, len(trials) // (_TASKS_OF_THREAD * max(1, threads))))
+        futures: list[Any] = []
+        for part in (trials[k : k + in_task] for k in range(0, len(trials), in_task)):
+            # the ids as key: a scheduler that still has the result for an earlier client returns it without a flight
+            key = hashlib.sha256("".join(trial.id for trial in part).encode()).hexdigest()
+            futures.append(client.submit(_fly_part, run, part, key=f"trials-{key}", pure=True))
+        for _, outcomes in dask_as_completed(futures, with_results=True):
+            yield from outcomes
 
     with client:
         yield fly
+
+
+def _fly_part(run: Callable[[Trial], Outcome], part: Sequence[Trial]) -> list[Outcome]:
+    return [run(trial) for trial in part]
 
 
 def write_table(outcomes: Iterable[Outcome], folder: Path) -> None:

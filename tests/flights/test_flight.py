@@ -1,5 +1,6 @@
 """Whole flights in virtual time: vehicles, links and station with real MAVLink bytes on one clock."""
 
+import gc
 import io
 from collections import Counter
 from dataclasses import replace
@@ -349,3 +350,20 @@ def test_tolerance_or_a_passive_station_breaks_triangle5_far_above_margin(
         error = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
         assert np.nanmax(error) == pytest.approx(29.0, abs=1.0)
         assert 11.0 < known(summary.settling_time_s) < 15.0
+
+
+@pytest.mark.parametrize("name", ["triangle5", "copters5"])
+def test_a_finished_flight_is_freed_without_garbage_collection(name: str) -> None:
+    """A campaign flies thousands in one process, in which collections are rare."""
+    plan, _ = planned(name, duration_s=1.0)
+
+    def stations_left() -> int:
+        return sum(isinstance(one, Station) for one in gc.get_objects())
+
+    before = stations_left()
+    gc.disable()
+    try:
+        assert sum(1 for _ in fly_lockstep(plan)) > 50
+        assert stations_left() == before
+    finally:
+        gc.enable()

@@ -1,0 +1,41 @@
+"""The events of a flight and why it is to end, to which the parts of a station write."""
+
+from gcs.control.own_law import LAW
+from gcs.control.tick import Event
+from scenarios.schema import NS_PER_S
+
+
+class Journal:
+    """Takes events as they happen. Times are of the station's clock; `now_ns` is that of the step under way.
+
+    It knows none of those who write to it. So a station that nobody needs any more is freed at once, not by the next
+    search for reference cycles.
+    """
+
+    def __init__(self, start_ns: int, patience_s: float) -> None:
+        self.now_ns = start_ns
+        self.events: list[Event] = []
+        self.stop = ""
+        """Why the flight is to end; the first reason counts."""
+        self.flight_start_ns: int | None = None
+        """When the formation flight began."""
+        self._start_ns, self._patience_s = start_ns, patience_s
+
+    def scenario_time_s(self, now_ns: int) -> float:
+        """Time since the formation flight began; before that, the time since the start minus the patience: negative."""
+        if self.flight_start_ns is None:
+            return (now_ns - self._start_ns) / NS_PER_S - self._patience_s
+        return (now_ns - self.flight_start_ns) / NS_PER_S
+
+    def request_stop(self, reason: str) -> None:
+        """End the flight at the next tick; without a reason, go on."""
+        self.stop = self.stop or reason
+
+    def report(self, kind: str, text: str, system_id: int | None = None) -> None:
+        """Record an event."""
+        time_s = self.scenario_time_s(self.now_ns)
+        self.events.append(Event(time_s=time_s, kind=kind, text=text, system_id=system_id))
+
+    def note_law(self, text: str, counts: dict[str, int] | None) -> None:
+        """Record an event of the user's control law."""
+        self.events.append(Event(time_s=self.scenario_time_s(self.now_ns), kind=LAW, text=text, counts=counts))
