@@ -10,7 +10,7 @@ import numpy as np
 from plain import ordered, report
 
 from gcs.control.phases import Phase
-from gcs.drive.udp import StationSocket, clock_ns, drive, prepare_real_time
+from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_ticks
 from gcs.runs.record import RunWriter
@@ -22,8 +22,7 @@ def main() -> None:
     scenario, port, out = ordered()
     _, plan = flight_plan(scenario)
     writer, used_s = RunWriter(out.parent), list[float]()
-    with StationSocket("127.0.0.1", port) as link:
-        prepare_real_time()
+    with StationSocket("127.0.0.1", port) as link, undisturbed(own_code=False):
         station = Station(plan, start_ns=clock_ns(), stopwatch_ns=time.perf_counter_ns)
 
         def stop() -> str:
@@ -38,7 +37,7 @@ def main() -> None:
     if not rows.size:
         sys.exit(station.end_reason)
     ticks, first = np.unique(rows["tick"], return_index=True)
-    late_s = (rows["sent_ns"][first] - rows["due_ns"][first]) / NS_PER_S
+    late_s = (np.maximum.reduceat(rows["sent_ns"], first) - rows["due_ns"][first]) / NS_PER_S
     last = rows[rows["tick"] == ticks[-1]]
     error_m = np.abs(np.nan_to_num([last["spacing_error_north_m"], last["spacing_error_east_m"]])).max()
     report(out, late_s, int(ticks[-1] - ticks[0] + 1), used_s[-1] - used_s[0], float(error_m))

@@ -162,7 +162,7 @@ def formation_control(
         sample_ns, state = newest
         spacing_error = command = nan, nan
         if own is not None:
-            spacing_error, command = _followed(history, own, newest, blend, nominal_velocity_m_s, opening)
+            spacing_error, command = _followed(history, own, row, newest, blend, nominal_velocity_m_s, opening)
         velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
         controls.append(VehicleControl(sample_ns, state, spacing_error, velocity_error, command, sample_ns))
     return controls
@@ -179,26 +179,28 @@ def command_at(
 ) -> tuple[float, float]:
     """The command of one vehicle from the errors at a given instant."""
     state = history.at(row, instant_ns) or _UNKNOWN.state
-    _, command = _followed(history, law, (instant_ns, state), blend, nominal_velocity_m_s, opening)
+    _, command = _followed(history, law, row, (instant_ns, state), blend, nominal_velocity_m_s, opening)
     return command
 
 
 def _followed(
     history: States,
     law: VehicleLaw,
+    row: int,
     newest: Report,
     blend: Blend,
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its given state."""
-    sample_ns, (north, east, _, _) = newest
+    sample_ns, own = newest
+    north, east, _, _ = own
     nominal_north, nominal_east = nominal_velocity_m_s
     command_north = command_east = 0.0
     spacing_error = nan, nan
     flown, former, share = blend
     for source, (offset_north, offset_east), gains in law.terms:
-        other = history.at(source, sample_ns) or _UNKNOWN.state
+        other = own if source == row else history.at(source, sample_ns) or _UNKNOWN.state
         # Positions are relative to the vehicle's own: sums of large numbers would lose digits.
         x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
         v_north, v_east = other[2] - nominal_north, other[3] - nominal_east

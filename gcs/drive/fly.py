@@ -13,7 +13,7 @@ from gcs.control.tick import Event
 from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
-from gcs.drive.udp import StationSocket, clock_ns, drive, prepare_real_time
+from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
 from gcs.interrupts import held_back, stop_signals
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
@@ -66,7 +66,7 @@ def fly(
                 started.enter_context(vehicles)
             writer = RunWriter(folder)
             _wait_until_ready(observer, folder, asked_to_stop)
-            prepare_real_time()
+            started.enter_context(undisturbed(own_code=plan.law is not None))
             station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS, stopwatch_ns=time.perf_counter_ns)
             if fleet:
                 writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=record.FLEET, text=fleet))

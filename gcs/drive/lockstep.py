@@ -132,5 +132,5 @@ def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard 
             outgoing = guard.sent(outgoing, now_ns)
         to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
         if tick is not None:
-            yield station.complete(tick, now_ns)
+            yield station.complete(tick, [now_ns] * len(outgoing))
             station.frames.clear()

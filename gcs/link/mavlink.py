@@ -47,13 +47,20 @@ class _Layout(NamedTuple):
     packing: struct.Struct
     length: int
     crc_extra: bytes
+    frame: struct.Struct
+    """Header and payload, up to the checksum."""
 
 
 SETUP_SIGNING = 256
 """Carries a key, so it is neither sent nor accepted, and never logged."""
 _MESSAGES: dict[int, Any] = dialect.mavlink_map
 _LAYOUTS = {
-    msg_id: _Layout(message.unpacker, message.unpacker.size, bytes([message.crc_extra]))
+    msg_id: _Layout(
+        message.unpacker,
+        message.unpacker.size,
+        bytes([message.crc_extra]),
+        struct.Struct(_HEADER.format + message.unpacker.format.lstrip("<")),
+    )
     for msg_id, message in _MESSAGES.items()
     if msg_id != SETUP_SIGNING
 }
@@ -178,7 +185,7 @@ def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
     if layout is None:
         refused["SETUP_SIGNING" if msg_id == SETUP_SIGNING else "unknown message"] += 1
         return None
-    packing, full_length, crc_extra = layout
+    packing, full_length, crc_extra, _ = layout
     end = begin + length
     if mcrf4xx(data[1:end] + crc_extra) != data[end] | data[end + 1] << 8:
         refused["bad checksum"] += 1
@@ -195,12 +202,13 @@ def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
 
 def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: int = STATION_SYSTEM_ID) -> bytes:
     """One unsigned MAVLink 2 frame, by default from the station; `fields` in wire order, `sequence` modulo 256."""
-    layout = _LAYOUTS[msg_id]
-    payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
-    source = system_id, STATION_COMPONENT_ID
-    header = _HEADER.pack(MAGIC, len(payload), 0, 0, sequence & 0xFF, *source, msg_id & 0xFFFF, msg_id >> 16)
-    body = header + payload
-    return body + mcrf4xx(body[1:] + layout.crc_extra).to_bytes(2, "little")
+    _, length, crc_extra, frame = _LAYOUTS[msg_id]
+    numbers = 0, 0, sequence & 0xFF, system_id, STATION_COMPONENT_ID, msg_id & 0xFFFF, msg_id >> 16
+    body = frame.pack(MAGIC, length, *numbers, *fields)
+    if not body[-1]:  # trailing zeros are omitted, except for the first byte of the payload
+        payload = body[_HEADER.size :].rstrip(b"\0") or b"\0"
+        body = _HEADER.pack(MAGIC, len(payload), *numbers) + payload
+    return body + mcrf4xx(body[1:] + crc_extra).to_bytes(2, "little")
 
 
 def heartbeat() -> tuple[Any, ...]:

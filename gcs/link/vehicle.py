@@ -103,6 +103,9 @@ class RemoteVehicle:
         self._report = report
         self._sequence = 0
         self._command: _Waiting | None = None
+        self._settled: Goal | bool | None = False
+        """The goal that the vehicle has reached, so that nothing is due until it says otherwise; False if there is
+        none. One with an autopilot is asked at every tick, as its start-up counts time."""
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still come."""
         self._not_before_ns = 0
@@ -203,6 +206,7 @@ class RemoteVehicle:
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a HEARTBEAT. One made before the vehicle carried out a command does not undo what its ACK said."""
+        self._settled = False
         custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
         armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
         recent_ns = now_ns - NS_PER_S - 2 * (self.clock.rtt_ns or 0)
@@ -295,11 +299,13 @@ class RemoteVehicle:
         one that comes sooner than a round trip after the next request with the same command does not count for that.
         """
         self._now_ns = now_ns
-        if self.address is None:
+        if self.address is None or self._settled is self.goal:
             return None
         frame = self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
             due = self.startup.next_parameter(now_ns, target_system=self.system_id, rtt_ns=self.clock.rtt_ns or 0)
+            if due is None and self._command is None and not self.kind.piloted and not self._next_step().missing:
+                self._settled = Goal.FLY
             return None if due is None else self.encode(*due)
         return frame
 
@@ -354,7 +360,7 @@ class RemoteVehicle:
         A vehicle that was taken over stays so: perhaps only its clock has slipped.
         """
         self.startup.begin_anew()
-        self._command = None
+        self._command, self._settled = None, False
 
 
 def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:

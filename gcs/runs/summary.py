@@ -334,9 +334,10 @@ def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> F
 
 
 def _control(scenario: Scenario, flown: TickArray) -> Control:
-    """Ticks flown, and deadline misses: set-points sent later than half a period after they were due, or not at all."""
+    """Ticks flown, and deadline misses: the last set-point sent over half a period after it was due, or none at all."""
     ticks, first = np.unique(flown["tick"], return_index=True)
-    late_s = (flown["sent_ns"][first] - flown["due_ns"][first]) * 1e-9
+    last_ns = np.maximum.reduceat(flown["sent_ns"], first) if first.size else flown["sent_ns"]
+    late_s = (last_ns - flown["due_ns"][first]) * 1e-9
     skipped = int(ticks[-1] - ticks[0] + 1 - ticks.size) if ticks.size else 0
     return Control(
         rate_hz=scenario.rates.control_hz,

@@ -76,7 +76,8 @@ class Station:
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
-        self._next_tick_ns = start_ns
+        self.next_tick_ns = start_ns
+        """When the next control tick is due."""
         self._next_heartbeat_ns = start_ns
         # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
         # vehicles are sent together.
@@ -99,7 +100,7 @@ class Station:
     @property
     def next_event_ns(self) -> int:
         """When `step` next has something to do even if nothing is received."""
-        return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_requests_ns)
+        return min(self.next_tick_ns, self._next_heartbeat_ns, self._next_requests_ns)
 
     def request_stop(self, reason: str) -> None:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
@@ -118,8 +119,10 @@ class Station:
         for datagram in datagrams:
             self._receive(datagram, outgoing)
         tick = None
-        if now_ns >= self._next_tick_ns:
+        if now_ns >= self.next_tick_ns:
             tick = self._tick(outgoing)
+        if tick is not None:
+            return outgoing, tick  # set-points do not wait for what may come in a step of its own
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
             for vehicle in self.vehicles:
@@ -130,9 +133,23 @@ class Station:
             self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
         return outgoing, tick
 
-    def complete(self, tick: Tick, sent_ns: int) -> TickArray:
-        """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom."""
-        rows, self._used_s = tick_rows(tick, sent_ns)
+    def complete(self, tick: Tick, sent_ns: Sequence[int]) -> TickArray:
+        """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
+
+        `sent_ns` says when each datagram of the step was sent. What need not be known before is judged here, so that no
+        set-point waits for it: whether the formation is broken, and who is back near its place.
+        """
+        slots_m = [reported.down_m for reported in tick.reported] if self._has_slots else None
+        distance_m = distances_m(tick.controls, tick.due_ns, slots_m)
+        nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
+        if self.phase is Phase.FLYING:
+            self._take_back(tick.controls)
+            self.request_stop(
+                self._breakage.judge(tick.controls, tick.monitored, self._absent, distance_m, nearest_m, tick.time_s)
+            )
+        newest_ns = sent_ns[-1] if sent_ns else self._now_ns
+        own_ns = [newest_ns if place < 0 else sent_ns[place] for place in tick.places]
+        rows, self._used_s = tick_rows(tick, nearest_m, own_ns)
         return rows
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
@@ -240,9 +257,9 @@ class Station:
     # -- the control tick ------------------------------------------------------------------------------------------
 
     def _tick(self, outgoing: list[Outgoing]) -> Tick:
-        due_ns = self._next_tick_ns
+        due_ns = self.next_tick_ns
         behind = (self._now_ns - due_ns) // self._period_ns
-        self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
+        self.next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
         self._decide(due_ns, outgoing)
         if self.phase is Phase.CONNECTING:
             self._fleet.locate(self._history)
@@ -254,15 +271,9 @@ class Station:
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
         controls = self._fleet.bounded(controls, blends)
         controls = [self._limited(control) for control in controls]
-        slots_m = [reported.down_m for reported in self._reported] if self._has_slots else None
-        distance_m = distances_m(controls, due_ns, slots_m)
-        nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
-        if flying:
-            states = self._monitor.states
-            self._take_back(controls)
-            self.request_stop(self._breakage.judge(controls, states, self._absent, distance_m, nearest_m, time_s))
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         followed: list[bool] = []
+        places: list[int] = []
         tolerated: list[Tolerated] = []
         for row, (vehicle, control, monitored) in enumerate(
             zip(self.vehicles, controls, self._monitor.states, strict=True)
@@ -271,7 +282,9 @@ class Station:
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
             order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
             fields = self._fleet.set_point(row, order, self.phase)
+            places.append(-1)
             if fields is not None:
+                places[row] = len(outgoing)
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._fleet.loop.sent(row, due_ns, fields)
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
@@ -285,7 +298,7 @@ class Station:
         tick = Tick(
             self._tick_count, time_s, due_ns, key_ms, self.vehicles, self._monitor.states, controls,
             self._reported.copy(), [fresh_s.popleft() if fresh_s else nan for fresh_s in self._fresh_rtt_s],
-            nearest_m, followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns),
+            followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns), places,
         )  # fmt: skip
         self._tick_count += 1 + behind
         return tick

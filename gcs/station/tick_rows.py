@@ -44,52 +44,54 @@ class Tick(NamedTuple):
     reported: Sequence[Reported]
     rtt_s: Sequence[float]
     """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
-    nearest_m: Sequence[float]
-    """NaN while unknown."""
     commanded: Sequence[bool]
     tolerated: Sequence[Tolerated]
     """How far the loop delay may be from the assumed delay."""
     repeated_s: Sequence[float]
     """See `gcs.control.loop_delay.Repetitions`."""
+    places: Sequence[int]
+    """Which of the datagrams of the step is the vehicle's set-point; -1 if none is."""
 
 
-def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
-    """The rows of a tick whose set-points were handed over at `sent_ns`, and how much of its margin each vehicle uses.
+def tick_rows(tick: Tick, nearest_m: Sequence[float], sent_ns: Sequence[int]) -> tuple[TickArray, list[float]]:
+    """The rows of a tick, and how much of its margin each vehicle uses.
 
-    That is in s, see `gcs.plan.mismatch.Tolerated.used_s`: the loop delay, or the mismatch with prediction.
+    `nearest_m` holds each vehicle's distance to the nearest other, NaN while unknown, and `sent_ns` when its set-point
+    was handed to the kernel. What is used is in s, see `gcs.plan.mismatch.Tolerated.used_s`: the loop delay, or the
+    mismatch with prediction.
     """
     packed: list[bytes] = []
     every_used_s: list[float] = []
-    for vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, tolerated, repeated_s in zip(
-        *tick[4:], strict=True
+    for vehicle, monitored, control, reported, rtt_s, commanded, tolerated, repeated_s, near_m, own_ns in zip(
+        *tick[4:-1], nearest_m, sent_ns, strict=True
     ):
         clock, frames = vehicle.clock, vehicle.frames
         estimate = clock.estimate
-        age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+        age_s = (own_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         down_s = down_bound_s = loop_bound_s = nan
-        down_ns = vehicle.delivery_ns(tick.key_ms, sent_ns)
+        down_ns = vehicle.delivery_ns(tick.key_ms, own_ns)
         if down_ns is not None:
             down_s, down_bound_s = down_ns * 1e-9, clock.down_bound_ns * 1e-9
             loop_bound_s = clock.loop_bound_ns * 1e-9 if control.used_ns == control.sample_ns else nan
         offset_s = bound_s = nan
         if estimate.samples > 0:
-            offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
-        loop_s = loop_delay_s(control.used_ns, sent_ns, down_s, repeated_s)
+            offset_s, bound_s = estimate.offset_at_ns(own_ns) * 1e-9, estimate.bound_at_ns(own_ns) * 1e-9
+        loop_s = loop_delay_s(control.used_ns, own_ns, down_s, repeated_s)
         margin_s = tolerated.longer_s[monitored.gain_set]
         # the age of a state is known, so only a set-point that acts at another instant than assumed is a mismatch
-        mismatch_s = (sent_ns - control.acts_ns) * 1e-9 + down_s if control.acts_ns > 0 else loop_s
+        mismatch_s = (own_ns - control.acts_ns) * 1e-9 + down_s if control.acts_ns > 0 else loop_s
         used_s = tolerated.used_s(monitored.gain_set, mismatch_s)
         every_used_s.append(used_s)
         packed.append(
             _ROW.pack(
-                tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
+                tick.number, tick.time_s, tick.due_ns, own_ns, tick.key_ms, vehicle.system_id,
                 monitored.mode, monitored.gain_set, commanded,
                 reported.boot_ms, control.sample_ns, age_s,
                 *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
-                nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
+                near_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
                 loop_s, loop_bound_s, repeated_s, control.assumed_s, control.assumed_s + margin_s,
                 headroom(used_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
                 offset_s, bound_s,

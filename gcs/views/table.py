@@ -140,7 +140,7 @@ class FlightState:
         heard = self._window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
         loop_delay_s, headroom = (np.where(heard, self._window[name], np.nan) for name in ("loop_delay_s", "headroom"))
         spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
-        late_s = (self._window["sent_ns"][:, :1] - self._window["due_ns"][:, :1]) / 1e9
+        late_s = (self._window["sent_ns"].max(axis=1, keepdims=True) - self._window["due_ns"][:, :1]) / 1e9
         return Figures(
             spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
             spacing_m=np.array(spacings_m),

@@ -19,7 +19,7 @@ import numpy as np
 from gcs.control.history import StateHistory
 from gcs.control.law import Blend, distances_m
 from gcs.control.loop_delay import Repetitions
-from gcs.control.loops import Moment
+from gcs.control.loops import Moment, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
@@ -65,13 +65,16 @@ class _Outline(NamedTuple):
     """Whether TIMESYNC requests are in the log."""
 
 
+_Commands = dict[int, tuple[int, Vector]]
+"""By system id, when a set-point was sent, and its acceleration."""
+
+
 @dataclass
 class _OpenTick:
     """A tick some of whose set-points have been read."""
 
     key_ms: int
-    sent_ns: int
-    commands: dict[int, tuple[float, float]] = field(default_factory=dict[int, tuple[float, float]])
+    commands: "_Commands" = field(default_factory=dict[int, tuple[int, Vector]])
 
 
 def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:
@@ -191,14 +194,13 @@ class _Rebuilding:
         key_ms, command, target = frame.fields[0], frame.fields[7:9], frame.fields[13]
         if self._open is None or self._open.key_ms != key_ms:
             self._close_tick()
-            self._open = _OpenTick(key_ms, time_ns)
-        self._open.sent_ns = time_ns
-        self._open.commands[target] = command
+            self._open = _OpenTick(key_ms)
+        self._open.commands[target] = time_ns, command
 
     def _close_tick(self) -> None:
         if self._open is not None:
             due_ns = self._outline.base_ns + self._open.key_ms * 1_000_000
-            self._tick(due_ns, self._open.sent_ns, self._open.commands, self._open.key_ms)
+            self._tick(due_ns, self._open.commands, self._open.key_ms)
             self._open = None
 
     def _look(self, time_ns: int) -> None:
@@ -208,10 +210,10 @@ class _Rebuilding:
             self._grid_ns = self._outline.base_ns + behind * self._period_ns
         while self._grid_ns < time_ns:
             if not self._outline.keys:  # vehicles count as flown once all have reported
-                commands = dict.fromkeys(self._row, (nan, nan)) if self._history.complete else {}
-                self._tick(self._grid_ns, self._grid_ns, commands, 0)
+                unknown = self._grid_ns, (nan, nan)
+                self._tick(self._grid_ns, dict.fromkeys(self._row, unknown) if self._history.complete else {}, 0)
             elif not self._own_ns[0] <= self._grid_ns <= self._own_ns[1]:
-                self._tick(self._grid_ns, self._grid_ns, {}, 0)
+                self._tick(self._grid_ns, {}, 0)
             self._grid_ns += self._period_ns
 
     def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
@@ -258,8 +260,9 @@ class _Rebuilding:
             self._telemetry_ns[row] = time_ns
             self._reported[row] = Reported(boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s)
 
-    def _tick(self, due_ns: int, sent_ns: int, commands: dict[int, tuple[float, float]], key_ms: int) -> None:
+    def _tick(self, due_ns: int, commands: _Commands, key_ms: int) -> None:
         """The rows of one tick, from what the station knew when it sent these set-points."""
+        sent_ns = max((own_ns for own_ns, _ in commands.values()), default=due_ns)
         time_s = (due_ns - self._start_ns) / NS_PER_S
         flying = bool(commands) and time_s >= 0
         if not flying:
@@ -272,16 +275,16 @@ class _Rebuilding:
         slots_m = [reported.down_m for reported in self._reported] if self._scenario.has_altitude_slots else None
         nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns, slots_m), axis=1).tolist()
         remotes = [vehicle.remote for vehicle in self._vehicles]
-        sent = [commands.get(remote.system_id) for remote in remotes]
+        sent = [commands.get(remote.system_id, (sent_ns, None)) for remote in remotes]
         tick = Tick(
             round((due_ns - self._start_ns) / self._period_ns), time_s, due_ns, key_ms, remotes, self._states,
-            [each._replace(command_m_s2=one or (nan, nan)) for each, one in zip(controls, sent, strict=True)],
+            [each._replace(command_m_s2=one or (nan, nan)) for each, (_, one) in zip(controls, sent, strict=True)],
             self._reported, [self._fresh_rtt_s(row, vehicle) for row, vehicle in enumerate(self._vehicles)],
-            nearest_m, [one is not None for one in sent],
+            [one is not None for _, one in sent],
             [self._fleet.plan.tolerance(control.assumed_s) for control in controls],
-            self._repetitions.repeated_s([control.used_ns for control in controls], due_ns),
+            self._repetitions.repeated_s([control.used_ns for control in controls], due_ns), (),
         )  # fmt: skip
-        rows, _ = tick_rows(tick, sent_ns)
+        rows, _ = tick_rows(tick, nearest_m, [own_ns for own_ns, _ in sent])
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:

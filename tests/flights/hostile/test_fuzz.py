@@ -141,7 +141,7 @@ def flown(plan: FlightPlan, fire: Fire | None, key: Key | None) -> tuple[TickArr
             fire.down.extend((system_id, data) for system_id, data, _ in down)
             down += fire.at_vehicles(now_ns)
         if tick is not None:
-            ticks.append(station.complete(tick, now_ns))
+            ticks.append(station.complete(tick, [now_ns] * len(outgoing)))
             station.frames.clear()
     for system_id in fleet.system_ids:  # vehicles live when something of theirs is due: now all have heard the same
         fleet.state(system_id, station.next_event_ns)
@@ -214,7 +214,7 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
                 datagrams += [Datagram(frame, ("virtual", own), now_ns) for frame in frames]
         outgoing, tick = station.step(datagrams, now_ns)
         if tick is not None:
-            rows = station.complete(tick, now_ns)
+            rows = station.complete(tick, [now_ns] * len(outgoing))
             station.frames.clear()
             commands = np.hypot(rows["command_north_m_s2"], rows["command_east_m_s2"])[rows["commanded"]]
             assert np.isfinite(commands).all()

@@ -204,7 +204,7 @@ def test_an_earlier_copy_from_elsewhere_makes_no_frame_a_replay() -> None:
         )
         down = [(int(address[1]), data, now_ns) for data, address in guard.sent(outgoing, now_ns)]
         if tick is not None:
-            ticks.append(station.complete(tick, now_ns))
+            ticks.append(station.complete(tick, [now_ns] * len(outgoing)))
     for name in calm.dtype.names or ():
         np.testing.assert_array_equal(np.concatenate(ticks)[name], calm[name], err_msg=name)
     assert station.counters == {"known system id from another address": copies}
