@@ -118,11 +118,8 @@ class Station:
         outgoing: list[Outgoing] = []
         for datagram in datagrams:
             self._receive(datagram, outgoing)
-        tick = None
         if now_ns >= self.next_tick_ns:
-            tick = self._tick(outgoing)
-        if tick is not None:
-            return outgoing, tick  # set-points do not wait for what may come in a step of its own
+            return outgoing, self._tick(outgoing)  # set-points do not wait for what may come in a step of its own
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
             for vehicle in self.vehicles:
@@ -131,7 +128,7 @@ class Station:
             while now_ns >= self._next_timesync_ns:
                 self._request_timesync(outgoing)
             self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
-        return outgoing, tick
+        return outgoing, None
 
     def complete(self, tick: Tick, sent_ns: Sequence[int]) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
