@@ -200,7 +200,7 @@ def run_script(script: str, *arguments: str, folder: Path, patience_s: float = _
     out = folder / "figures.json"
     command = [sys.executable, str(SCRIPTS / f"{script}.py"), *arguments, str(out)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=patience_s, check=False)
     except subprocess.TimeoutExpired:
         raise PeerError(f"no result after {patience_s:g} s") from None
     if not out.exists():
