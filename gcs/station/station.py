@@ -279,12 +279,12 @@ class Station:
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
             order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
             fields = self._fleet.set_point(row, order, self.phase)
-            places.append(-1)
+            place = len(outgoing)
             if fields is not None:
-                places[row] = len(outgoing)
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._fleet.loop.sent(row, due_ns, fields)
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
+            places.append(place if len(outgoing) > place else -1)
             followed.append(commanded)
             tolerated.append(self.plan.tolerance(control.assumed_s))
         self._monitor.margins_s = [each.longer_s for each in tolerated]

@@ -33,7 +33,7 @@ def test_a_vehicle_is_set_up_one_command_at_a_time() -> None:
     assert (interval.command, interval.param1, interval.param2, interval.target_system) == (511, 32, 20000, 2)
     for command, wanted, parameter in ((511, 176, 4.0), (176, 400, 0.0)):
         ack = peer.datagram(peer.link.command_ack_encode(command, 0), S)
-        outgoing, _ = station.step([ack], station.next_event_ns + 20 * MS)
+        outgoing, _ = station.step([ack], station.next_tick_ns)
         (sent,) = messages(outgoing, "COMMAND_LONG")
         assert (sent.command, sent.param2) == (wanted, parameter)
 
