@@ -147,6 +147,9 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         console.print(f"         {late}: headroom {number_text(found.headroom_p99, '.0%')}")
     if found.channels_not_included:
         console.print("         without the time that datagrams wait for their channel, which only a flight shows")
+    for key, (given, simulated) in found.response_differs.items():
+        simulated_text = f"the simulated autopilots have {number_text(simulated, 'g')}"
+        console.print(f"response {key} {number_text(given, 'g')}, for which the control is designed: {simulated_text}")
     if found.closest_m is not None:
         when = f", at {found.closest_s:.1f} s" if found.closest_s else ""
         console.print(f"places   at least {found.closest_m:.2f} m between any two vehicles{when}")

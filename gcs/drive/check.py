@@ -87,6 +87,8 @@ class ScenarioCheck(Published):
     planned: tuple[PlannedMotionCheck, ...]
     """Of each vehicle, if the formation manoeuvres."""
     vehicles: tuple[VehicleCheck, ...]
+    response_differs: dict[str, tuple[float | None, float | None]]
+    """The keys in which the given `response` differs from the simulated `autopilot`: the value of each."""
     code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
     """The code that would be run: its file by the key that names it."""
 
@@ -146,8 +148,16 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         course=_course(scenario) if scenario.course.is_smooth else None,
         planned=tuple(_planned(scenario, formation)) if scenario.manoeuvres else (),
         vehicles=tuple(vehicles),
+        response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
+
+
+def _response_differs(scenario: Scenario) -> dict[str, tuple[float | None, float | None]]:
+    if scenario.response is None or scenario.dynamics != "autopilot":
+        return {}
+    both = {key: (value, getattr(scenario.autopilot, key)) for key, value in scenario.response.model_dump().items()}
+    return {key: (given, simulated) for key, (given, simulated) in both.items() if given != simulated}
 
 
 def _course(scenario: Scenario) -> CourseCheck:

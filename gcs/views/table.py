@@ -198,7 +198,7 @@ def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    margin = f"{ms_text(state.margin_s, '.0f', unit='')} ms (sampled, {loop} loop, fastest gains)"
+    margin = f"{ms_text(state.margin_s, '.0f', unit='')} ms ({loop} loop, fastest gains)"
     line.append(f"   delay margin {'unknown' if state.margin_unknown else margin}", style="dim")
     line.no_wrap = True
     return line

@@ -13,7 +13,7 @@ import socket
 import struct
 import time  # noqa: TID251 - this is the real-time driver
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from typing import NamedTuple
 
 from scenarios.schema import NS_PER_S
@@ -29,7 +29,7 @@ LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
 DATAGRAM_BYTES = 2048
 READS_PER_WAKE = 1000
-"""Datagrams read from one socket before the others, so that a flood into it cannot block them."""
+"""Datagrams read from one socket at a time, so that a flood into it cannot hold up what is due."""
 LATE_NS = 5_000_000
 """A datagram that leaves later than this is counted: the emulated link then differs from the scenario's."""
 CLOCK_GAP_NS = 3_000
@@ -98,23 +98,25 @@ class Sockets:
         self._woken_ns = time.monotonic_ns()
 
     def receive(self) -> list[Received]:
-        """Everything that has arrived, at most `READS_PER_WAKE` datagrams from each socket."""
+        """Everything that has arrived, at most `READS_PER_WAKE` datagrams from each socket, in turn."""
         begin_ns = time.monotonic_ns()
         to_monotonic_ns = self._clocks.to_monotonic_ns()
         received: list[Received] = []
-        emptied = True
-        for descriptor, _ in self._epoll.poll(0):
-            read = 0
-            for data, stamp_ns, address in self._read(self._sockets[descriptor]):
+        for _ in range(READS_PER_WAKE):
+            ready = self._epoll.poll(0)
+            if not ready:
+                self._emptied_ns = begin_ns
+                break
+            for descriptor, _ in ready:
+                read = self._read(self._sockets[descriptor])
+                if read is None:
+                    continue
+                data, stamp_ns, address = read
                 # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
                 latest_ns = time.monotonic_ns()
                 time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
                 time_ns = min(max(time_ns, self._emptied_ns), latest_ns)
                 received.append(Received(descriptor, data, time_ns, address))
-                read += 1
-            emptied = emptied and read < READS_PER_WAKE
-        if emptied:
-            self._emptied_ns = begin_ns
         return received
 
     def send(self, descriptor: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
@@ -134,20 +136,20 @@ class Sockets:
             self.counters["left_late"] += 1
             self.latest_ns = max(self.latest_ns, late_ns)
 
-    def _read(self, own: socket.socket) -> Iterator[tuple[bytes, int | None, tuple[str, int]]]:
-        for _ in range(READS_PER_WAKE):
-            try:
-                data, ancillary, _, address = own.recvmsg(DATAGRAM_BYTES, 64)
-            except BlockingIOError:
-                return
-            except OSError:  # the ICMP answer to a datagram sent while nobody listened
-                self.counters["receive_refused"] += 1
-                continue
-            stamp_ns = None
-            if ancillary and len(ancillary[0][2]) == _STAMP.size:
-                seconds, nanoseconds = _STAMP.unpack(ancillary[0][2])
-                stamp_ns = seconds * NS_PER_S + nanoseconds
-            yield data, stamp_ns, address
+    def _read(self, own: socket.socket) -> tuple[bytes, int | None, tuple[str, int]] | None:
+        """One datagram with its stamp and sender; None if there is none after all."""
+        try:
+            data, ancillary, _, address = own.recvmsg(DATAGRAM_BYTES, 64)
+        except BlockingIOError:
+            return None
+        except OSError:  # the ICMP answer to a datagram sent while nobody listened
+            self.counters["receive_refused"] += 1
+            return None
+        stamp_ns = None
+        if ancillary and len(ancillary[0][2]) == _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack(ancillary[0][2])
+            stamp_ns = seconds * NS_PER_S + nanoseconds
+        return data, stamp_ns, address
 
 
 class Ports:

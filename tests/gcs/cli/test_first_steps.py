@@ -138,3 +138,15 @@ def test_what_cannot_be_used_is_one_line(
     assert wanted in told
     assert told.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["there.toml"]
+
+
+def test_check_names_a_response_that_simulated_autopilots_do_not_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "copters.toml"
+    given = "\n[response]\nlag_s = {}\nvelocity_gain_1_s = 2.0\n"
+    for lag_s, told in ((0.1, True), (0.15, False)):
+        file.write_text(copied("copters5", "copters") + given.format(lag_s), encoding="utf-8")
+        assert gcs(monkeypatch, "check", file) == 0
+        line = "response lag_s 0.1, for which the control is designed: the simulated autopilots have 0.15"
+        assert (line in capsys.readouterr().out) == told

@@ -121,7 +121,7 @@ def test_header_and_footer_say_phase_time_progress_lateness_and_skips() -> None:
     text = "\n".join(drawn(state))
     for wanted in (
         "line3  flying  5.0 s",
-        "delay margin 400 ms (sampled, ground loop, fastest gains)",
+        "delay margin 400 ms (ground loop, fastest gains)",
         "15.0 s of 20.0 s left",
         "least headroom 12 % (vehicle 2)",
         "tick lateness p99 2.50 ms",
