@@ -50,7 +50,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],
     ),
     "compile": (
-        "compile the hot path (needs a C compiler): about a quarter faster; undone when a source changes",
+        "compile the hot path (needs a C compiler): a quarter to a half faster; undone when a source changes",
         [f"mypyc {COMPILED}"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
