@@ -11,6 +11,12 @@ _MEASURED = "at_delay_s", "delays_s", "delay_rate"
 _WITHOUT_DELAY = "damping_min", "natural_frequency_max_rad_s"
 
 
+def response_wanted(dynamics: str) -> str:
+    """What a scenario without a response lacks, and where its value is found."""
+    found = "a flight leaves in design.json" if dynamics == "autopilot" else "gcs identify finds"
+    return f"a [response], which {found}"
+
+
 def contradictions(scenario: Scenario) -> Iterator[Fault]:
     """Faults of `control.criteria`, `control.overlap` and `control.for_link` that no single key shows."""
     yield from _criteria_contradictions(scenario)
@@ -69,7 +75,8 @@ def _for_link_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if control.prediction != "off":
         yield key, control.for_link, "off, with prediction: it is chosen together with the gains"
     if scenario.dynamics != "double_integrator" and scenario.response is None:
-        yield key, control.for_link, f"off, with dynamics {scenario.dynamics} and no [response] (gcs identify)"
+        wanted = f"off, with dynamics {scenario.dynamics}, or {response_wanted(scenario.dynamics)}"
+        yield key, control.for_link, wanted
     if control.criteria is None:
         return
     for name in _MEASURED:

@@ -62,7 +62,7 @@ TICK = np.dtype(
         ("tick", "<i8"),  # counts control ticks, from 0; a number left out is a tick that was skipped
         ("time_s", "<f8"),  # scenario time; below 0 before the formation is flown
         ("due_ns", "<i8"),  # when the tick was due, station clock
-        ("sent_ns", "<i8"),  # when the vehicle's set-point had been handed to the kernel, station clock
+        ("sent_ns", "<i8"),  # when the vehicle's set-point, or else the tick's last datagram, was with the kernel
         ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
         ("system_id", "u1"),  # the vehicle that the row is about
         ("mode", "u1"),  # its mode, as a number

@@ -30,7 +30,7 @@ START_NS = 1_000_000_000
 EPOCH_NS = 1_800_000_000 * 1_000_000_000
 """Virtual time 0 of a signed flight, in ns since 1970."""
 _HOST = "virtual"
-_FLIGHTS_COLLECTED = 100
+_FLIGHTS_A_COLLECTION = 100
 """Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
 _flights = count(1)
 
@@ -114,7 +114,7 @@ def fly_lockstep(
         yield from _ticks(plan, station, vehicles, guard)
     finally:
         gc.unfreeze()
-        if next(_flights) % _FLIGHTS_COLLECTED == 0:
+        if next(_flights) % _FLIGHTS_A_COLLECTION == 0:
             gc.collect()
 
 

@@ -103,9 +103,9 @@ class RemoteVehicle:
         self._report = report
         self._sequence = 0
         self._command: _Waiting | None = None
-        self._settled: Goal | bool | None = False
-        """The goal that the vehicle has reached, so that nothing is due until it says otherwise; False if there is
-        none. One with an autopilot is asked at every tick, as its start-up counts time."""
+        self._settled = False
+        """Whether the vehicle takes set-points and lacks nothing, so that no command is due until it says otherwise.
+        One with an autopilot never counts as settled, because its start-up counts time."""
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still come."""
         self._not_before_ns = 0
@@ -265,6 +265,7 @@ class RemoteVehicle:
         if result == _IN_PROGRESS:
             waiting.sent_ns = now_ns
             return
+        self._settled = False
         earlier, answers = self._earlier
         if earlier == command and answers > 0 and now_ns - waiting.sent_ns < (self.clock.rtt_ns or 0):
             self._earlier = earlier, answers - 1  # too soon for an answer to this request
@@ -299,13 +300,13 @@ class RemoteVehicle:
         one that comes sooner than a round trip after the next request with the same command does not count for that.
         """
         self._now_ns = now_ns
-        if self.address is None or self._settled is self.goal:
+        if self.address is None or (self._settled and self.goal is Goal.FLY):
             return None
         frame = self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
             due = self.startup.next_parameter(now_ns, target_system=self.system_id, rtt_ns=self.clock.rtt_ns or 0)
-            if due is None and self._command is None and not self.kind.piloted and not self._next_step().missing:
-                self._settled = Goal.FLY
+            idle = due is None and self._command is None and not self.kind.piloted
+            self._settled = idle and not self._next_step().missing
             return None if due is None else self.encode(*due)
         return frame
 

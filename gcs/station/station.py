@@ -56,6 +56,7 @@ class Station:
         self.end_reason = ""
         self._journal = journal = Journal(start_ns, patience_s(scenario))
         self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
+        """See `Journal`."""
         self.frames: list[tuple[bytes, int]] = []
         """Frames received since the driver last took them, each with the time at which it was received."""
         self.counters: Counter[str] = Counter()
@@ -133,8 +134,8 @@ class Station:
     def complete(self, tick: Tick, sent_ns: Sequence[int]) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
 
-        `sent_ns` says when each datagram of the step was sent. What need not be known before is judged here, so that no
-        set-point waits for it: whether the formation is broken, and who is back near its place.
+        `sent_ns` says when each datagram of the step was sent. What set-points need not wait for is judged here:
+        whether the formation is broken, and who is back near its place.
         """
         slots_m = [reported.down_m for reported in tick.reported] if self._has_slots else None
         distance_m = distances_m(tick.controls, tick.due_ns, slots_m)
@@ -145,7 +146,7 @@ class Station:
                 self._breakage.judge(tick.controls, tick.monitored, self._absent, distance_m, nearest_m, tick.time_s)
             )
         newest_ns = sent_ns[-1] if sent_ns else self._now_ns
-        own_ns = [newest_ns if place < 0 else sent_ns[place] for place in tick.places]
+        own_ns = [newest_ns if index < 0 else sent_ns[index] for index in tick.set_point_indices]
         rows, self._used_s = tick_rows(tick, nearest_m, own_ns)
         return rows
 
@@ -270,7 +271,7 @@ class Station:
         controls = [self._limited(control) for control in controls]
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         followed: list[bool] = []
-        places: list[int] = []
+        indices: list[int] = []
         tolerated: list[Tolerated] = []
         for row, (vehicle, control, monitored) in enumerate(
             zip(self.vehicles, controls, self._monitor.states, strict=True)
@@ -279,12 +280,12 @@ class Station:
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
             order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
             fields = self._fleet.set_point(row, order, self.phase)
-            place = len(outgoing)
+            index = len(outgoing)
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._fleet.loop.sent(row, due_ns, fields)
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
-            places.append(place if len(outgoing) > place else -1)
+            indices.append(index if len(outgoing) > index else -1)
             followed.append(commanded)
             tolerated.append(self.plan.tolerance(control.assumed_s))
         self._monitor.margins_s = [each.longer_s for each in tolerated]
@@ -295,7 +296,7 @@ class Station:
         tick = Tick(
             self._tick_count, time_s, due_ns, key_ms, self.vehicles, self._monitor.states, controls,
             self._reported.copy(), [fresh_s.popleft() if fresh_s else nan for fresh_s in self._fresh_rtt_s],
-            followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns), places,
+            followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns), indices,
         )  # fmt: skip
         self._tick_count += 1 + behind
         return tick

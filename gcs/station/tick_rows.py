@@ -49,8 +49,8 @@ class Tick(NamedTuple):
     """How far the loop delay may be from the assumed delay."""
     repeated_s: Sequence[float]
     """See `gcs.control.loop_delay.Repetitions`."""
-    places: Sequence[int]
-    """Which of the datagrams of the step is the vehicle's set-point; -1 if none is."""
+    set_point_indices: Sequence[int]
+    """Index of the vehicle's set-point among the datagrams of the step; -1 if it was sent none."""
 
 
 def tick_rows(tick: Tick, nearest_m: Sequence[float], sent_ns: Sequence[int]) -> tuple[TickArray, list[float]]:

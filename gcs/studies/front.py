@@ -30,6 +30,7 @@ from gcs.stress.campaign import local_workers
 from gcs.views.page import figure_of, saved
 from gcs.watch.for_link import evaluated
 from scenarios.keys.part import PREDICTION_MAX_S
+from scenarios.requirements import response_wanted
 from scenarios.schema import FixedGains, Scenario
 
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr")
@@ -104,7 +105,7 @@ def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
     response, dynamics = given_response(scenario), scenario.dynamics
     for read, given, wanted in (
         ("loop onboard", scenario.control.loop == "onboard", "loop ground"),
-        (f"dynamics {dynamics}", dynamics != "double_integrator" and response is None, "a [response] (gcs identify)"),
+        (f"dynamics {dynamics}", dynamics != "double_integrator" and response is None, response_wanted(dynamics)),
         ("graph-lqr and a [response]", response is not None and "graph-lqr" in methods, "--method inclusion"),
     ):
         if given:

@@ -74,7 +74,7 @@ class _OpenTick:
     """A tick some of whose set-points have been read."""
 
     key_ms: int
-    commands: "_Commands" = field(default_factory=dict[int, tuple[int, Vector]])
+    commands: _Commands = field(default_factory=dict[int, tuple[int, Vector]])
 
 
 def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:

@@ -29,7 +29,7 @@ LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
 DATAGRAM_BYTES = 2048
 READS_PER_WAKE = 1000
-"""Datagrams read from one socket at a time, so that a flood into it cannot hold up what is due."""
+"""Most datagrams read from one socket before the vehicles act again, so that a flood cannot hold them up."""
 LATE_NS = 5_000_000
 """A datagram that leaves later than this is counted: the emulated link then differs from the scenario's."""
 CLOCK_GAP_NS = 3_000
@@ -219,7 +219,7 @@ def run(
 def undisturbed() -> Generator[None]:
     """While entered, timers are as exact as the kernel allows, no garbage collection runs, and priority is real-time.
 
-    The priority needs root or a limit on it that allows 1 (`ulimit -r`); without, the process runs as any other.
+    Real-time priority needs root, or `ulimit -r` of at least 1; without either it is left as it is.
     """
     # The default timer slack lets the kernel delay a wake-up by 50 µs.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
@@ -234,4 +234,5 @@ def undisturbed() -> Generator[None]:
     finally:
         gc.enable()
         gc.unfreeze()
-        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))

@@ -138,10 +138,14 @@ def test_a_scenario_for_measured_links_is_not_designed_without_them() -> None:
 
 def test_gains_for_a_link_are_refused_to_vehicles_of_unknown_response() -> None:
     late = coded(dynamics="lagged").model_copy(update={"control": Control()})
-    with pytest.raises(InputError, match=r"read dynamics own.py:lagged, wanted a \[response\] \(gcs identify\)"):
+    with pytest.raises(
+        InputError, match=r"read dynamics own.py:lagged, wanted a \[response\], which gcs identify finds"
+    ):
         searched_in(late, ("inclusion",))
     for_link = late.model_copy(update={"control": Control(for_link="measured")})
-    with pytest.raises(ScenarioError, match=r"for_link: read 'measured', wanted off, with dynamics own.py"):
+    with pytest.raises(
+        ScenarioError, match=r"for_link: read 'measured', wanted off, with dynamics own.py:lagged, or a \[response\]"
+    ):
         checked(for_link, Path("own.toml"))
     known = {"response": Response(lag_s=0.2)}
     with pytest.raises(InputError, match=r"read graph-lqr and a \[response\], wanted --method inclusion"):

@@ -47,7 +47,7 @@ def test_every_column_holds_what_its_name_says() -> None:
         Tolerated((inf, 0.2), (0.2, 0.3)),
         0.01,
     ]
-    tick = Tick(11, 0.22, 10 * S + 40_000_000, 220, *([each, each] for each in seen), places=[0, 1])
+    tick = Tick(11, 0.22, 10 * S + 40_000_000, 220, *([each, each] for each in seen), set_point_indices=[0, 1])
     rows, used_s = tick_rows(tick, [121.5, 121.5], [10 * S + 50_000_000] * 2)
     expected = {
         "tick": 11, "time_s": 0.22, "due_ns": 10 * S + 40_000_000, "sent_ns": 10 * S + 50_000_000, "key_ms": 220,
@@ -76,7 +76,7 @@ def test_what_is_not_known_is_not_a_number() -> None:
     nan, pair = np.nan, (np.nan, np.nan)
     nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair, 0)
     seen: list[Any] = [vehicle, VehicleState(), nothing, Reported(), nan, False, Tolerated((inf,), (0.4,)), 0.0]
-    rows, used_s = tick_rows(Tick(0, -1.0, S, 0, *([each] for each in seen), places=[-1]), [nan], [S])
+    rows, used_s = tick_rows(Tick(0, -1.0, S, 0, *([each] for each in seen), set_point_indices=[-1]), [nan], [S])
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
     floats = {name for name in TICK.names or () if TICK[name].kind == "f"}
     assert unknown == floats - {"time_s", "repeated_s", "assumed_delay_s", "delay_margin_s"}
