@@ -1,21 +1,22 @@
 """Vehicles with autopilots: their start, one common frame, identification, set-points."""
 
-from collections.abc import Sequence
 from math import hypot
-from typing import Any
+
+import numpy as np
 
 from gcs.autopilot.identify import LEAST_RATE_HZ
 from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.startup import AutopilotStartup, between
 from gcs.autopilot.vehicle_limits import Bounds
-from gcs.autopilot.velocity_targets import VelocityTargets
+from gcs.autopilot.velocity_targets import VelocitySetPoint, VelocityTargets
 from gcs.control.history import StateHistory
-from gcs.control.law import Blend, VehicleControl
-from gcs.control.loops import Order
+from gcs.control.loops import Orders
 from gcs.control.manoeuvring import loop_of
 from gcs.control.phases import START_PATIENCE_S, Phase
-from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
+from gcs.link import mavlink
+from gcs.link.vehicle import RemoteVehicle, Report, in_words, new_links, refusals
 from gcs.plan.flight_plan import FlightPlan
+from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
 
 _UNANNOUNCED_S = 3.0
@@ -44,6 +45,7 @@ class AutopilotFleet:
             )
             for vehicle in scenario.leader_first()
         ]
+        self.links = new_links(len(ids))
         self.vehicles = [
             RemoteVehicle(
                 system_id,
@@ -51,10 +53,12 @@ class AutopilotFleet:
                 report=report,
                 land=scenario.at_end == "land",
                 external=system_id == scenario.external_id,
+                links=self.links,
+                row=row,
             )
-            for system_id, startup in zip(ids, self.starts, strict=True)
+            for row, (system_id, startup) in enumerate(zip(ids, self.starts, strict=True))
         ]
-        self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(ids)
+        self.frame_ned_m = np.zeros((len(ids), 3))
         self._report = report
         self._lacks = [("", 0)] * len(ids)
         """What each vehicle lacks, and since when; 0 once that has been reported."""
@@ -127,7 +131,7 @@ class AutopilotFleet:
             if first.origin is None or startup.origin is None:
                 continue
             north, east = between(first.origin, startup.origin)
-            known_north, known_east, _ = self.frame_ned_m[row]
+            known_north, known_east, _ = self.frame_ned_m[row].tolist()
             if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:
                 history.forget(row)
             else:
@@ -147,16 +151,28 @@ class AutopilotFleet:
             self.plan, self._identification = found, None
         return ""
 
-    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
-        return self._bounds.bounded(controls, blends)
+    def bound(self, controls: Records, blends: Records) -> None:
+        self._bounds.bound(controls, blends)
 
     def _rest(self, row: int) -> None:
         self._targets.rest(row)
         self._bounds.rest(row)
 
-    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
-        vehicle, (control, commanded, _, key_ms, due_ns) = self.vehicles[row], order
-        command, known = control.command_m_s2, control.sample_ns > 0
+    def set_points(self, orders: Orders, phase: Phase) -> Records:
+        points = np.zeros(len(self.vehicles), mavlink.SET_POINT)
+        points["type_mask"] = mavlink.IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION
+        for row in range(len(self.vehicles)):
+            point = self._set_point(row, orders, phase)
+            if point is not None:
+                points["sent"][row] = True
+                points["velocity_ned_m_s"][row], points["acceleration_ne_m_s2"][row] = point
+        return points
+
+    def _set_point(self, row: int, orders: Orders, phase: Phase) -> VelocitySetPoint | None:
+        vehicle, control, due_ns = self.vehicles[row], orders.controls[row], orders.due_ns
+        commanded = bool(orders.commanded[row])
+        (north, east), sample_ns = control["command_m_s2"].tolist(), control["sample_ns"].item()
+        command, known = (north, east), sample_ns > 0
         if vehicle.left_out:
             return None
         piloted = vehicle.taken_over and vehicle.kind.guided_first
@@ -165,7 +181,7 @@ class AutopilotFleet:
             return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
         if (phase is Phase.CONNECTING and self.starts[row].airborne) or others:
-            return self._targets.hover(row, key_ms=key_ms)  # PX4 enters OFFBOARD only while set-points arrive
+            return self._targets.hover(row)  # PX4 enters OFFBOARD only while set-points arrive
         if phase is Phase.IDENTIFYING and self._identification is not None:
             command, commanded = self._identification.command(due_ns), True
             known = known or self._targets.steers(row)  # a clock that jumped does not interrupt the manoeuvre
@@ -175,7 +191,7 @@ class AutopilotFleet:
         if not vehicle.guided:
             self._rest(row)  # set-points show it that a station is there; they start from its own velocity
         self.loop.remember(row, due_ns, command)
-        late_s = (due_ns - control.sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if control.sample_ns else 0.0
+        late_s = (due_ns - sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if sample_ns else 0.0
         lead_m_s = self._bounds.acceleration_m_s2(row) * (late_s + _LEAD_S)
-        velocity_m_s = control.state[2:4]
-        return self._targets.accelerate(row, command, velocity_m_s, lead_m_s=lead_m_s, key_ms=key_ms, now_ns=due_ns)
+        _, _, v_north, v_east = control["state"].tolist()
+        return self._targets.accelerate(row, command, (v_north, v_east), lead_m_s=lead_m_s, now_ns=due_ns)

@@ -9,10 +9,10 @@ from math import hypot, inf, isfinite, sqrt
 from typing import Any
 
 from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER
-from gcs.control.law import Blend, VehicleControl
 from gcs.link import mavlink
 from gcs.link.kinds import Kind
 from gcs.plan.flight_plan import FlightPlan, own_gains
+from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
 
 ACCELERATION_M_S2, JERK_M_S3 = 2.0, 4.0
@@ -106,34 +106,39 @@ class Bounds:
         """The vehicle is commanded nothing; its next command starts from zero."""
         self._last[row], self._approaches[row] = (0.0, 0.0), True
 
-    def bounded(self, controls: Sequence[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
-        """The commands along the braking curve, within the limits of acceleration and jerk."""
-        return [self._bounded(row, control, blends[row]) for row, control in enumerate(controls)]
+    def bound(self, controls: Records, blends: Records) -> None:
+        """Keep the commands to the braking curve, and within the limits of acceleration and jerk."""
+        flown = blends["flown"].tolist()
+        both = zip(controls["command_m_s2"].tolist(), controls["spacing_error_m"].tolist(), strict=True)
+        for row, (command, spacing_error) in enumerate(both):
+            if isfinite(command[0]) and isfinite(command[1]):
+                controls["command_m_s2"][row] = self._bounded(row, command, spacing_error, flown[row])
 
-    def _bounded(self, row: int, control: VehicleControl, blend: Blend) -> VehicleControl:
-        north, east = control.command_m_s2
-        if not (isfinite(north) and isfinite(east)):
-            return control
+    def _bounded(
+        self, row: int, command_m_s2: Sequence[float], spacing_error_m: Sequence[float], flown: int
+    ) -> tuple[float, float]:
         limit = self.acceleration_m_s2(row)
-        less_north, less_east = self._braking(row, control, blend, _BRAKING_SHARE * limit)
-        north, east = north - less_north, east - less_east
+        less_north, less_east = self._braking(row, spacing_error_m, flown, _BRAKING_SHARE * limit)
+        north, east = command_m_s2[0] - less_north, command_m_s2[1] - less_east
         north, east = _shortened(north, east, limit)
         (was_north, was_east), jerk = self._last[row], self._limits[row].jerk_bound_m_s3
         far = hypot(north - was_north, east - was_east) / (jerk * self._period_s)
         if far > 1.0:
             north, east = was_north + (north - was_north) / far, was_east + (east - was_east) / far
         self._last[row] = north, east
-        return control._replace(command_m_s2=(north, east))
+        return north, east
 
-    def _braking(self, row: int, control: VehicleControl, blend: Blend, braking_m_s2: float) -> tuple[float, float]:
+    def _braking(
+        self, row: int, spacing_error_m: Sequence[float], flown: int, braking_m_s2: float
+    ) -> tuple[float, float]:
         """By how much the linear law commands too large an acceleration, far from the vehicle's place.
 
         Under the law an error e closes at the speed lambda e, lambda = k3 / k1. Beyond e_0 = b / lambda^2 that would
         need braking harder than b; the speed there is sqrt(2 b (e - e_0 / 2)) instead.
         """
-        error_north, error_east = control.spacing_error_m
+        error_north, error_east = spacing_error_m
         error_m = hypot(error_north, error_east)
-        gains = self._gains[blend.flown]
+        gains = self._gains[flown]
         if gains is None or not error_m > 0.0:  # NaN for the leader
             return 0.0, 0.0
         k1, k3 = gains[row]

@@ -7,15 +7,15 @@ integral of its commanded accelerations, and is sent both.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
 
 from gcs.autopilot.startup import AutopilotStartup
-from gcs.link import mavlink
 from gcs.link.vehicle import RemoteVehicle
 
 _CLIMB_GAIN_1_S = 0.5
 _CLIMB_MAX_M_S = 1.0
 _Vector = tuple[float, float]
+VelocitySetPoint = tuple[tuple[float, float, float], tuple[float, float]]
+"""Velocity (north, east, down) and acceleration (north, east)."""
 
 
 @dataclass
@@ -34,10 +34,10 @@ class VelocityTargets:
         self._targets: list[_Target | None] = [None] * len(vehicles)
         self._period_s = period_s
 
-    def hover(self, row: int, *, key_ms: int) -> tuple[Any, ...]:
+    def hover(self, row: int) -> VelocitySetPoint:
         """The set-point that keeps a vehicle where it is."""
         self._targets[row] = None
-        return self._fields(row, key_ms, (0.0, 0.0), (0.0, 0.0))
+        return self._with_climb(row, (0.0, 0.0), (0.0, 0.0))
 
     def rest(self, row: int) -> None:
         """Send no set-point: the next one starts from the vehicle's velocity."""
@@ -48,8 +48,8 @@ class VelocityTargets:
         return self._targets[row] is not None
 
     def accelerate(
-        self, row: int, acceleration_m_s2: _Vector, velocity_m_s: _Vector, *, lead_m_s: float, key_ms: int, now_ns: int
-    ) -> tuple[Any, ...]:
+        self, row: int, acceleration_m_s2: _Vector, velocity_m_s: _Vector, *, lead_m_s: float, now_ns: int
+    ) -> VelocitySetPoint:
         """The set-point of a commanded acceleration.
 
         `velocity_m_s` is the vehicle's newest; it may be NaN if the vehicle has a velocity target, which keeps within
@@ -71,15 +71,10 @@ class VelocityTargets:
         # A vehicle that holds the velocity between set-points is sent that of the middle of the period.
         ahead_s = 0.0 if self._vehicles[row].kind.velocity_grows else self._period_s / 2.0
         sent = north + ahead_s * acceleration_m_s2[0], east + ahead_s * acceleration_m_s2[1]
-        return self._fields(row, key_ms, sent, acceleration_m_s2)
+        return self._with_climb(row, sent, acceleration_m_s2)
 
-    def _fields(self, row: int, key_ms: int, velocity_m_s: _Vector, acceleration_m_s2: _Vector) -> tuple[Any, ...]:
+    def _with_climb(self, row: int, velocity_m_s: _Vector, acceleration_m_s2: _Vector) -> VelocitySetPoint:
         startup = self._starts[row]
         missing_m = startup.altitude_m - (startup.relative_altitude_m or 0.0)
         climb_m_s = max(-_CLIMB_MAX_M_S, min(_CLIMB_MAX_M_S, _CLIMB_GAIN_1_S * missing_m))
-        return mavlink.velocity_set_point(
-            key_ms=key_ms,
-            target_system=self._vehicles[row].system_id,
-            velocity_ned_m_s=(*velocity_m_s, -climb_m_s),
-            acceleration_ne_m_s2=acceleration_m_s2,
-        )
+        return (*velocity_m_s, -climb_m_s), acceleration_m_s2

@@ -114,6 +114,7 @@ def fly(
             print_design(design)
         viewer = None if live is None else options.live_viewer(live)
         folder = options.run_folder(out, scenario.name)
+        options.say_if_first_flight()
         if link is None:
             summary = flying.fly_in_virtual_time(
                 plan, design, folder, show_table=not as_json, speed=speed, viewer=viewer

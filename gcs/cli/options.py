@@ -125,6 +125,14 @@ def within(option: str, value: float, least: float, most: float, unit: str = "")
         raise InputError(f"{option}: read {value:g}, wanted {unit or 'a number'} from {least:g} to {most:g}")
 
 
+def say_if_first_flight() -> None:
+    """Say on a terminal why the first flight on a machine begins late."""
+    from scenarios.kernel import any_kept
+
+    if sys.stderr.isatty() and not any_kept():
+        print("first flight on this machine: compiling what runs for every frame, about 20 s", file=sys.stderr)
+
+
 def refuse(file: Path, *findings: str | None) -> None:
     """Refuse a scenario for the first of these findings that is not None."""
     for finding in findings:

@@ -1,10 +1,8 @@
 """What `gcs stress`, `compare`, `bench` and `capacity` print, and what `gcs stress` checks for CI."""
 
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from shutil import which
 
 from rich.console import Console
 from rich.text import Text
@@ -219,8 +217,7 @@ _LOAD_COLUMNS: dict[str, Callable[[Load], str]] = {
 
 
 def print_benchmark(result: Benchmark) -> None:
-    how = "compiled" if result.compiled else "interpreted"
-    print(f"{result.vehicles} vehicles at {result.control_hz:g} Hz, one core, hot path {how}")
+    print(f"{result.vehicles} vehicles at {result.control_hz:g} Hz, one core")
     print(
         f"virtual time    {result.real_time_factor:.3g} times real time "
         f"(best of {result.flights}; median {result.real_time_factor_p50:.3g})"
@@ -241,9 +238,6 @@ def print_benchmark(result: Benchmark) -> None:
             f"signed          takes {cost.time_ratio:.2f} times as long (median {cost.time_ratio_p50:.2f}), "
             f"the station {cost.station_time_ratio:.2f} times (median {cost.station_time_ratio_p50:.2f})"
         )
-    if not result.compiled:
-        first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
-        print(f"compiled        about a quarter faster: {first}python3 make.py compile")
 
 
 def print_peers(found: SideBySide) -> None:

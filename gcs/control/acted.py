@@ -21,6 +21,7 @@ along the velocity, says nothing about the set-points under way.
 import struct
 from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Sequence
 from math import inf, isfinite
 from typing import Any, Protocol
 
@@ -35,7 +36,7 @@ _ASIDE = 0.02
 _ROUNDED = 2.0**-22
 """Two values are the same if they differ by this share at most: two steps of a float32."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
-"""Places among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
+"""Places among the fields of POSITION_TARGET_LOCAL_NED."""
 _ON_THE_WIRE = struct.Struct("<2f")
 
 
@@ -45,9 +46,9 @@ class Alterable(Protocol):
     def alter(self, due_ns: int, by_m_s2: complex) -> None: ...
 
 
-def _vector(fields: tuple[Any, ...], place: slice) -> complex:
+def _carried(vector: Sequence[float]) -> complex:
     """North + 1j * east as the link carries it."""
-    return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*fields[place])))
+    return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*vector)))
 
 
 def _is_same(reported: complex, sent: complex) -> bool:
@@ -76,11 +77,11 @@ class ActiveTargets:
         self._largest_m_s2 = inf
         """The size to which the vehicle clips."""
 
-    def sent(self, due_ns: int, fields: tuple[Any, ...]) -> None:
-        """Remember a set-point as it was sent; `history` must hold it already."""
+    def sent(self, due_ns: int, velocity_m_s: Sequence[float], acceleration_m_s2: Sequence[float]) -> None:
+        """Remember a set-point as it was sent, north and east; `history` must hold it already."""
         self._due_ns.append(due_ns)
-        self._velocity.append(_vector(fields, _VELOCITY))
-        self._acceleration.append(_vector(fields, _ACCELERATION))
+        self._velocity.append(_carried(velocity_m_s))
+        self._acceleration.append(_carried(acceleration_m_s2))
         self._off.append(0j)
         self._clip_from(len(self._off) - 1)
         old = bisect_left(self._due_ns, due_ns - 9 * self._held_ns)
@@ -89,13 +90,13 @@ class ActiveTargets:
 
     def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
         """Take in the fields of a report; `at_ns` is its instant on the station's clock."""
-        acceleration, only = _vector(fields, _ACCELERATION), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
+        acceleration, only = _carried(fields[_ACCELERATION]), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
         recent = range(oldest, bisect_right(self._due_ns, at_ns))
         value, same = acceleration, [place for place in recent if _is_same(acceleration, self._acceleration[place])]
         if not same and not only:
-            value = _vector(fields, _VELOCITY)
+            value = _carried(fields[_VELOCITY])
             same = [place for place in recent if _is_same(value, self._velocity[place])]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
             # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages

@@ -1,19 +1,25 @@
-"""The states that vehicles reported, kept long enough to bring any two of them to one instant.
+"""The states that vehicles reported, kept long enough to bring any two of them to one instant."""
 
-Scalars and plain tuples: for single reports numpy would be ten times slower.
-"""
-
-from collections import deque
 from collections.abc import Sequence
+from math import nan
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from scenarios.kernel import Records, kernel
 
 State = tuple[float, float, float, float]
 """Position north and east in m, velocity north and east in m/s."""
 Report = tuple[int, State]
 """A state with its instant on the station's clock in ns."""
+Instants = NDArray[np.int64]
 
 HISTORY = 128
 """Reports kept for each vehicle: 2.6 s at 50 Hz, enough for links whose delays differ by that much."""
+REPORT = np.dtype([("time_ns", "i8"), ("state", "f8", (4,))], align=True)
+_UNKNOWN = (nan, nan, nan, nan)
 
 
 class States(Protocol):
@@ -21,6 +27,10 @@ class States(Protocol):
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing."""
+        ...
+
+    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
+        """The states (m, 4) of m vehicles, each at an instant of its own; NaN where nothing was reported."""
         ...
 
 
@@ -31,74 +41,137 @@ class Reports(States, Protocol):
         """The newest report of a vehicle; None if it has reported nothing."""
         ...
 
+    def every_newest(self) -> tuple[Instants, FloatArray]:
+        """Instant and state (n, 4) of the newest report of each vehicle; 0 and NaN where there is none."""
+        ...
+
+
+def each_at(states: States, vehicles: Sequence[int], times_ns: Sequence[int]) -> FloatArray:
+    """`States.every_at`, one by one."""
+    found = (states.at(vehicle, time_ns) or _UNKNOWN for vehicle, time_ns in zip(vehicles, times_ns, strict=True))
+    return np.array([*found]).reshape(-1, 4)
+
 
 class StateHistory:
     """The newest reports of n vehicles."""
 
     def __init__(self, vehicles: int) -> None:
-        self._reports: list[deque[Report]] = [deque(maxlen=HISTORY) for _ in range(vehicles)]
+        self.reports: Records = np.zeros((vehicles, HISTORY), REPORT)
+        """The newest of each vehicle, in turn."""
+        self.counts = np.zeros(vehicles, np.int64)
+        """How many reports each vehicle has made."""
+        self._times_ns, self._states = memoryview(self.reports["time_ns"]), memoryview(self.reports["state"])
 
     def add(self, vehicle: int, time_ns: int, state: State) -> bool:
         """Take in a report; returns False for one that is not newer than the newest, which is ignored."""
-        reports = self._reports[vehicle]
-        if reports and time_ns <= reports[-1][0]:
-            return False
-        reports.append((time_ns, state))
-        return True
+        return add_report(self.reports, self.counts, vehicle, time_ns, *state)
 
     def forget(self, vehicle: int) -> None:
         """Drop what a vehicle reported, for example after its clock has jumped."""
-        self._reports[vehicle].clear()
+        self.counts[vehicle] = 0
 
     def of(self, vehicles: Sequence[int]) -> "StateHistory":
         """The same reports of some of the vehicles, whose rows count from 0 again."""
-        some = StateHistory(0)
-        some._reports = [self._reports[vehicle] for vehicle in vehicles]
+        some = StateHistory(len(vehicles))
+        some.reports[:], some.counts[:] = self.reports[[*vehicles]], self.counts[[*vehicles]]
         return some
 
     @property
     def complete(self) -> bool:
-        return all(self._reports)
+        return bool(self.counts.all())
 
     def newest(self, vehicle: int) -> Report | None:
-        reports = self._reports[vehicle]
-        return reports[-1] if reports else None
+        count = self.counts.item(vehicle)
+        if not count:
+            return None
+        k, states = (count - 1) % HISTORY, self._states
+        north, east, v_north, v_east = (states[vehicle, k, part] for part in range(4))
+        return self._times_ns[vehicle, k], (north, east, v_north, v_east)
+
+    def every_newest(self) -> tuple[Instants, FloatArray]:
+        return _every_newest(self.reports, self.counts)
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
-        """The state of a vehicle at an instant; None if it has reported nothing.
+        """The state of a vehicle at an instant; None if it has reported nothing. See `state_at`."""
+        return state_at(self.reports, self.counts, vehicle, time_ns) if self.counts[vehicle] else None
 
-        Between two reports the position is cubic through both positions and velocities, and the velocity linear; both
-        are exact for a constant acceleration. The cubic's slope is not used as velocity: it would contain errors of the
-        reports' instants, as when a clock estimate moves, and the rounding of positions. After the newest report and
-        before the oldest, the state is extrapolated with that report's velocity.
-        """
-        reports = self._reports[vehicle]
-        if not reports:
-            return None
-        after = reports[-1]
-        if time_ns < after[0]:
-            for k in range(2, len(reports) + 1):  # mostly one step or two
-                before = reports[-k]
-                if before[0] <= time_ns:
-                    return _between(before, after, time_ns)
-                after = before
-        north, east, v_north, v_east = after[1]
-        since_s = (time_ns - after[0]) * 1e-9
-        return north + v_north * since_s, east + v_east * since_s, v_north, v_east
+    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
+        return _every_at(self.reports, self.counts, vehicles, times_ns)
 
 
-def _between(a: Report, b: Report, time_ns: int) -> State:
+@kernel
+def add_report(
+    reports: Records, counts: NDArray[np.int64], row: int,
+    time_ns: int, north: float, east: float, v_north: float, v_east: float,
+) -> bool:  # fmt: skip
+    """See `StateHistory.add`."""
+    count = counts[row]
+    if count and time_ns <= reports[row, (count - 1) % HISTORY].time_ns:
+        return False
+    report = reports[row, count % HISTORY]
+    report.time_ns = time_ns
+    report.state[0], report.state[1], report.state[2], report.state[3] = north, east, v_north, v_east
+    counts[row] = count + 1
+    return True
+
+
+@kernel
+def state_at(reports: Records, counts: NDArray[np.int64], row: int, time_ns: int) -> State:
+    """The state of a vehicle at an instant, if it has reported any.
+
+    Between two reports the position is cubic through both positions and velocities, and the velocity linear; both are
+    exact for a constant acceleration. The cubic's slope is not used as velocity: it would contain errors of the
+    reports' instants, as when a clock estimate moves, and the rounding of positions. After the newest report and before
+    the oldest, the state is extrapolated with that report's velocity.
+    """
+    count = counts[row]
+    after = reports[row, (count - 1) % HISTORY]
+    if time_ns < after.time_ns:
+        for k in range(2, min(count, HISTORY) + 1):  # mostly one step or two
+            before = reports[row, (count - k) % HISTORY]
+            if before.time_ns <= time_ns:
+                return _between(before.time_ns, before.state, after.time_ns, after.state, time_ns)
+            after = before
+    newest, since_s = after.state, (time_ns - after.time_ns) * 1e-9
+    return newest[0] + newest[2] * since_s, newest[1] + newest[3] * since_s, newest[2], newest[3]
+
+
+@kernel
+def _between(a_ns: int, a: FloatArray, b_ns: int, b: FloatArray, time_ns: int) -> State:
     """Cubic Hermite interpolation of position, linear of velocity."""
-    (a_ns, (north, east, v_north, v_east)), (b_ns, (north_b, east_b, v_north_b, v_east_b)) = a, b
     span_s = (b_ns - a_ns) * 1e-9
     x = (time_ns - a_ns) * 1e-9 / span_s
-    v0, v1, rise = v_north * span_s, v_north_b * span_s, north_b - north
-    w0, w1, rise_east = v_east * span_s, v_east_b * span_s, east_b - east
+    v0, v1, rise = a[2] * span_s, b[2] * span_s, b[0] - a[0]
+    w0, w1, rise_east = a[3] * span_s, b[3] * span_s, b[1] - a[1]
     c2, c3 = 3.0 * rise - 2.0 * v0 - v1, v0 + v1 - 2.0 * rise
     d2, d3 = 3.0 * rise_east - 2.0 * w0 - w1, w0 + w1 - 2.0 * rise_east
     return (
-        north + x * (v0 + x * (c2 + x * c3)),
-        east + x * (w0 + x * (d2 + x * d3)),
-        v_north + x * (v_north_b - v_north),
-        v_east + x * (v_east_b - v_east),
+        a[0] + x * (v0 + x * (c2 + x * c3)),
+        a[1] + x * (w0 + x * (d2 + x * d3)),
+        a[2] + x * (b[2] - a[2]),
+        a[3] + x * (b[3] - a[3]),
     )
+
+
+@kernel
+def _every_newest(reports: Records, counts: NDArray[np.int64]) -> tuple[Instants, FloatArray]:
+    times_ns, states = np.zeros(len(counts), np.int64), np.full((len(counts), 4), nan)
+    for row in range(len(counts)):
+        if counts[row]:
+            report = reports[row, (counts[row] - 1) % HISTORY]
+            times_ns[row] = report.time_ns
+            for k in range(4):
+                states[row, k] = report.state[k]
+    return times_ns, states
+
+
+@kernel
+def _every_at(
+    reports: Records, counts: NDArray[np.int64], vehicles: NDArray[np.int64], times_ns: Instants
+) -> FloatArray:
+    states = np.full((len(vehicles), 4), nan)
+    for place in range(len(vehicles)):
+        if counts[vehicles[place]]:
+            north, east, v_north, v_east = state_at(reports, counts, vehicles[place], times_ns[place])
+            states[place, 0], states[place, 1], states[place, 2], states[place, 3] = north, east, v_north, v_east
+    return states

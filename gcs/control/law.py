@@ -9,14 +9,18 @@ margin.
 """
 
 from collections.abc import Sequence
-from math import nan
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.control.history import Report, Reports, State, States
+from gcs.control.history import Instants, Reports, States
 from gcs.plan.formation import Formation
+from scenarios.kernel import Array, Records, kernel
 
 Gain = tuple[float, float, float, float, float, float, float, float]
 """A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""
@@ -44,8 +48,44 @@ class VehicleLaw(NamedTuple):
     """The vehicle that spacing is kept to, one of the terms; -1 if there is none."""
 
 
-FeedbackLaw = tuple[VehicleLaw | None, ...]
-"""The law of each vehicle; None if it is lost."""
+_LOST = -2
+
+
+class PackedLaw(NamedTuple):
+    """The laws of n vehicles with m terms in all, as arrays for kernels."""
+
+    begin: NDArray[np.int64]
+    """Place of each vehicle's first term, and m, (n + 1,)."""
+    to: NDArray[np.int64]
+    """The vehicle that each term commands, (m,)."""
+    source: NDArray[np.int64]
+    """The vehicle whose state it uses, (m,)."""
+    offset_ne_m: FloatArray
+    """(m, 2)"""
+    gains: FloatArray
+    """(m, sets, 8)"""
+    ahead: NDArray[np.int64]
+    """`VehicleLaw.ahead`, -2 for a lost vehicle, (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeedbackLaw:
+    """The law of each vehicle; None if it is lost."""
+
+    vehicles: tuple[VehicleLaw | None, ...]
+
+    @cached_property
+    def packed(self) -> PackedLaw:
+        terms = [(to, term) for to, law in enumerate(self.vehicles) if law is not None for term in law.terms]
+        counts = [0 if law is None else len(law.terms) for law in self.vehicles]
+        return PackedLaw(
+            np.cumsum([0, *counts]),
+            np.array([to for to, _ in terms], np.int64),
+            np.array([term.source for _, term in terms], np.int64),
+            np.array([term.offset_ne_m for _, term in terms]).reshape(-1, 2),
+            np.array([term.gains for _, term in terms]) if terms else np.zeros((0, 1, 8)),
+            np.array([_LOST if law is None else law.ahead for law in self.vehicles], np.int64),
+        )
 
 
 def feedback_law(
@@ -101,7 +141,7 @@ def feedback_law(
         terms = tuple(Term(k, offset(i, k), tuple(tuple(G.ravel().tolist()) for G in blocks[i, k])) for k in sources)
         return VehicleLaw(terms, in_front[i])
 
-    return tuple(None if lost[i] else law(i) for i in range(len(in_front)))
+    return FeedbackLaw(tuple(None if lost[i] else law(i) for i in range(len(in_front))))
 
 
 def _stand_ins(predecessors: Sequence[int], gone: Sequence[bool]) -> tuple[list[int], list[int]]:
@@ -112,127 +152,153 @@ def _stand_ins(predecessors: Sequence[int], gone: Sequence[bool]) -> tuple[list[
     return stand_in, [stand_in[ahead] if ahead >= 0 else -1 for ahead in predecessors]
 
 
-class Blend(NamedTuple):
-    """The gains of one vehicle: `share` of the set `flown`, and 1 - `share` of the set `former`."""
-
-    flown: int = 0
-    former: int = 0
-    share: float = 1.0
-
-
-class VehicleControl(NamedTuple):
-    """State, errors and command of one vehicle, north and east; NaN where unknown or lost."""
-
-    sample_ns: int
-    """Instant of its newest state, station clock; 0 while there is none."""
-    state: State
-    spacing_error_m: tuple[float, float]
-    velocity_error_m_s: tuple[float, float]
-    command_m_s2: tuple[float, float]
-    used_ns: int
-    """Instant of the errors from which the command was computed: `sample_ns` with the loop on the ground."""
-    assumed_s: float = 0.0
-    """The loop delay over which the errors were predicted; 0 without prediction."""
-    acts_ns: int = 0
-    """When the command is assumed to act, to which instant the errors were predicted; 0 without prediction."""
+BLEND = np.dtype([("flown", "i8"), ("former", "i8"), ("share", "f8")])
+"""The gains of one vehicle: `share` of the set `flown`, and 1 - `share` of the set `former`."""
+CONTROL = np.dtype(
+    [
+        ("sample_ns", "i8"),  # instant of its newest state, station clock; 0 while there is none
+        ("state", "f8", (4,)),  # see `gcs.control.history.State`
+        ("spacing_error_m", "f8", (2,)),
+        ("velocity_error_m_s", "f8", (2,)),
+        ("command_m_s2", "f8", (2,)),
+        ("used_ns", "i8"),  # instant of the errors from which the command was computed; on the ground `sample_ns`
+        ("assumed_s", "f8"),  # the loop delay over which the errors were predicted; 0 without prediction
+        ("acts_ns", "i8"),  # when the command is assumed to act, to which instant they were; 0 without prediction
+    ]
+)
+"""State, errors and command of one vehicle, north and east; NaN where unknown or lost."""
 
 
-_UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)
+def unblended(vehicles: int) -> Records:
+    """Of BLEND: every vehicle flies the first set of gains."""
+    blends = np.zeros(vehicles, BLEND)
+    blends["share"] = 1.0
+    return blends
 
 
 def formation_control(
     history: Reports,
     law: FeedbackLaw,
-    blends: Sequence[Blend],
+    blends: Records,
     *,
     nominal_velocity_m_s: tuple[float, float],
     opening: float = 1.0,
-) -> list[VehicleControl]:
-    """Errors and commands of every vehicle from the newest reported states.
+) -> Records:
+    """Errors and commands of every vehicle (n, CONTROL) from the newest reported states.
 
     `blends` holds the gains of each vehicle, `opening` is a factor on the formation's spacing. If a law needs an
     unknown state its command is NaN and must not be sent. No limit is applied here.
     """
-    controls: list[VehicleControl] = []
-    for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
-        newest = history.newest(row)
-        if newest is None:
-            controls.append(_UNKNOWN)
-            continue
-        sample_ns, state = newest
-        spacing_error = command = nan, nan
-        if own is not None:
-            spacing_error, command = _followed(history, own, row, newest, blend, nominal_velocity_m_s, opening)
-        velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
-        controls.append(VehicleControl(sample_ns, state, spacing_error, velocity_error, command, sample_ns))
+    times_ns, states = history.every_newest()
+    controls = np.empty(len(times_ns), CONTROL)
+    seen = history.every_at(law.packed.source, times_ns.take(law.packed.to))
+    _control(controls, law.packed, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
     return controls
 
 
-def command_at(
-    history: States,
-    law: VehicleLaw,
-    row: int,
-    instant_ns: int,
-    blend: Blend,
+def commands_at(
+    states: States,
+    law: FeedbackLaw,
+    times_ns: Instants,
+    blends: Records,
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
-) -> tuple[float, float]:
-    """The command of one vehicle from the errors at a given instant."""
-    state = history.at(row, instant_ns) or _UNKNOWN.state
-    _, command = _followed(history, law, row, (instant_ns, state), blend, nominal_velocity_m_s, opening)
-    return command
+) -> FloatArray:
+    """The command (n, 2) of each vehicle from the errors at an instant of its own."""
+    packed = law.packed
+    own = states.every_at(np.arange(len(times_ns)), times_ns)
+    seen, others = own[packed.to], (packed.source != packed.to).nonzero()[0]
+    seen[others] = states.every_at(packed.source[others], times_ns[packed.to[others]])
+    return commands_of(law, own, seen, blends, nominal_velocity_m_s, opening)
 
 
-def _followed(
-    history: States,
-    law: VehicleLaw,
-    row: int,
-    newest: Report,
-    blend: Blend,
+def commands_of(
+    law: FeedbackLaw,
+    own: FloatArray,
+    seen: FloatArray,
+    blends: Records,
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its given state."""
-    sample_ns, own = newest
-    north, east, _, _ = own
-    nominal_north, nominal_east = nominal_velocity_m_s
-    command_north = command_east = 0.0
-    spacing_error = nan, nan
-    flown, former, share = blend
-    for source, (offset_north, offset_east), gains in law.terms:
-        other = own if source == row else history.at(source, sample_ns) or _UNKNOWN.state
-        # Positions are relative to the vehicle's own: sums of large numbers would lose digits.
-        x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
-        v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
-        g = gains[flown] if share >= 1.0 else _blended(gains[flown], gains[former], share)
-        command_north += g[0] * x + g[1] * y + g[2] * v_north + g[3] * v_east
-        command_east += g[4] * x + g[5] * y + g[6] * v_north + g[7] * v_east
-        if source == law.ahead:
-            spacing_error = x, y
-    return spacing_error, (command_north, command_east)
+) -> FloatArray:
+    """The same from the vehicles' own states (n, 4) and those that the terms of their laws use (m, 4)."""
+    controls = np.empty(len(own), CONTROL)
+    _control(controls, law.packed, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
+    return controls["command_m_s2"]
 
 
-def _blended(new: Gain, old: Gain, share: float) -> Gain:
-    a, b, c, d, e, f, g, h = (share * one + (1.0 - share) * other for one, other in zip(new, old, strict=True))
-    return a, b, c, d, e, f, g, h
+@kernel
+def _control(
+    controls: Records, law: PackedLaw, times_ns: Array, states: Array, seen: Array, blends: Records,
+    nominal_north: float, nominal_east: float, opening: float,
+) -> None:  # fmt: skip
+    """Fill in the controls: the command of each vehicle is the sum of G_ik (x_k - x*_k) over its terms."""
+    g = np.empty(8)
+    for row in range(len(controls)):
+        control, state, flown = controls[row], states[row], law.ahead[row] != _LOST
+        control.sample_ns = control.used_ns = times_ns[row]
+        control.assumed_s, control.acts_ns = 0.0, 0
+        for k in range(4):
+            control.state[k] = state[k]
+        control.velocity_error_m_s[0], control.velocity_error_m_s[1] = state[2] - nominal_north, state[3] - nominal_east
+        control.spacing_error_m[0] = control.spacing_error_m[1] = nan
+        command_north = command_east = 0.0 if flown else nan
+        share, first, former = blends[row].share, blends[row].flown, blends[row].former
+        for term in range(law.begin[row], law.begin[row + 1]):
+            source = law.source[term]
+            other = state if source == row else seen[term]
+            # Positions are relative to the vehicle's own: sums of large numbers would lose digits.
+            x = other[0] - state[0] - opening * law.offset_ne_m[term, 0]
+            y = other[1] - state[1] - opening * law.offset_ne_m[term, 1]
+            v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
+            for k in range(8):
+                g[k] = law.gains[term, first, k]
+                if share < 1.0:
+                    g[k] = share * g[k] + (1.0 - share) * law.gains[term, former, k]
+            command_north += g[0] * x + g[1] * y + g[2] * v_north + g[3] * v_east
+            command_east += g[4] * x + g[5] * y + g[6] * v_north + g[7] * v_east
+            if source == law.ahead[row]:
+                control.spacing_error_m[0], control.spacing_error_m[1] = x, y
+        control.command_m_s2[0], control.command_m_s2[1] = command_north, command_east
 
 
-def distances_m(controls: Sequence[VehicleControl], now_ns: int, down_m: Sequence[float] | None = None) -> FloatArray:
-    """Distances (n, n) between vehicles in m; NaN where unknown and on the diagonal.
+class Nearest(NamedTuple):
+    """How near vehicles are to one another."""
 
-    Positions are brought to `now_ns` along the reported velocities. `down_m` holds the vehicles' positions down if they
-    fly at different altitudes; without it, distances are horizontal.
+    distance_m: FloatArray
+    """Of each vehicle to the nearest other, (n,); NaN while unknown."""
+    two: tuple[int, int]
+    """The two that are nearest."""
+
+
+def nearest(controls: Records, now_ns: int, down_m: FloatArray | None = None) -> Nearest:
+    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
+
+    `down_m` holds the vehicles' positions down if they fly at different altitudes; without it, distances are
+    horizontal.
     """
-    age_s = (now_ns - np.array([control.sample_ns for control in controls])) * 1e-9
-    north, east, v_north, v_east = np.array([control.state for control in controls]).T
-    north, east = north + v_north * age_s, east + v_east * age_s
-    square, more = north[:, None] - north, east[:, None] - east
-    square *= square  # in place: these are the largest arrays of a tick
-    more *= more
-    square += more
-    distance = np.sqrt(square, out=square)
-    if down_m is not None:
-        below = np.array(down_m)
-        distance = np.sqrt(distance * distance + np.square(below[:, None] - below))
-    distance.flat[:: len(controls) + 1] = nan  # the diagonal
-    return distance
+    return Nearest(*_nearest(controls, now_ns, np.empty(0) if down_m is None else down_m))
+
+
+@kernel
+def _nearest(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
+    """See `nearest`; `down_m` is empty if it does not matter."""
+    n = len(controls)
+    north, east, near = np.empty(n), np.empty(n), np.full(n, inf)
+    for row in range(n):
+        state, age_s = controls[row].state, (now_ns - controls[row].sample_ns) * 1e-9
+        north[row], east[row] = state[0] + state[2] * age_s, state[1] + state[3] * age_s
+    least, one, two = inf, 0, 0
+    for row in range(n):
+        for other in range(row + 1, n):
+            x, y = north[row] - north[other], east[row] - east[other]
+            square = x * x + y * y
+            if len(down_m):
+                level, below = sqrt(square), down_m[row] - down_m[other]
+                square = level * level + below * below
+            near[row] = min(near[row], square)
+            near[other] = min(near[other], square)
+            if square < least:
+                least, one, two = square, row, other
+    for row in range(n):
+        near[row] = sqrt(near[row]) if near[row] < inf else nan
+    return near, (one, two)

@@ -2,17 +2,14 @@
 
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
 
+from gains.core.arrays import FloatArray
+from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import Limits
 
 LARGEST_COMMAND_M_S2 = 9_999.0
 """The limit if the scenario sets none: a larger command is a fault, not a manoeuvre. Vehicles refuse more than 1e4,
 which rounding to float32 must not reach."""
-
-Vector = tuple[float, float]
-_VELOCITY, _ACCELERATION = slice(4, 6), slice(7, 9)
-"""North and east among the fields of SET_POSITION_TARGET_LOCAL_NED."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +23,28 @@ class SetPointLimits:
     def of(cls, limits: Limits) -> "SetPointLimits":
         return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
 
-    def command(self, wanted_m_s2: Vector) -> Vector:
-        """A wanted acceleration, shortened to the limit in its own direction; the same object if it is within."""
-        return _shortened(wanted_m_s2, self.acceleration_m_s2)
+    def limit_commands(self, commands_m_s2: FloatArray) -> None:
+        """Shorten accelerations (n, 2) to the limit, each in its own direction."""
+        _shorten(commands_m_s2, self.acceleration_m_s2)
 
-    def set_point(self, fields: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The fields of a set-point, velocity and acceleration within the limits; the same object if they were."""
-        wanted_m_s, wanted_m_s2 = fields[_VELOCITY], fields[_ACCELERATION]
-        velocity_m_s, acceleration_m_s2 = _shortened(wanted_m_s, self.speed_m_s), self.command(wanted_m_s2)
-        if velocity_m_s is wanted_m_s and acceleration_m_s2 is wanted_m_s2:
-            return fields
-        return (*fields[:4], *velocity_m_s, fields[6], *acceleration_m_s2, *fields[9:])
+    def limit(self, points: Records) -> None:
+        """Shorten the velocities and accelerations of set-points (n, SET_POINT) to the limits."""
+        _shorten(points["velocity_ned_m_s"][:, :2], self.speed_m_s)
+        _shorten(points["acceleration_ne_m_s2"], self.acceleration_m_s2)
 
 
-def _shortened(vector: Any, longest: float) -> Vector:
-    north, east = vector
-    size = hypot(north, east)
-    return (north * longest / size, east * longest / size) if size > longest else vector
+def _shorten(vectors: FloatArray, longest: float) -> None:
+    if any_beyond(vectors, 0.7 * longest):  # one of them may be longer
+        for row, (north, east) in enumerate(vectors.tolist()):
+            size = hypot(north, east)
+            if size > longest:
+                vectors[row] = north * longest / size, east * longest / size
+
+
+@kernel
+def any_beyond(vectors: Array, largest: float) -> bool:
+    """Whether a component of a vector is larger than so much."""
+    beyond = False
+    for row in range(len(vectors)):
+        beyond |= abs(vectors[row, 0]) > largest or abs(vectors[row, 1]) > largest
+    return beyond

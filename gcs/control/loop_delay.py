@@ -14,7 +14,7 @@ command computed from it acts:
   does not count as delay, because the margin already accounts for the telemetry period. The extra age that lost
   telemetry causes does count.
 * With the loop on the ground the state is the vehicle's newest. With loops on board it is the oldest among the newest
-  states that the streamed command needs (`VehicleControl.used_ns`).
+  states that the streamed command needs (`used_ns` of `gcs.control.law.CONTROL`).
 
 Error: up and down depend on the estimated offset of the vehicle's clock, and each may be wrong by `sample_bound_s` and
 `down_bound_s` of the tick record. If both use the same offset, its error cancels: it lengthens one by as much as it
@@ -22,9 +22,12 @@ shortens the other. What remains is `loop_delay_bound_s`: the millisecond in whi
 the stamps in TIMESYNC replies, and what the estimate changed between the two.
 """
 
-from collections.abc import Sequence
-from math import ceil, nan
+from math import ceil, inf, nan
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
 from scenarios.schema import NS_PER_S, Rates
 
 _SAME_RATE = 1e-4
@@ -41,7 +44,7 @@ def loop_delay_s(used_ns: int, sent_ns: int, down_s: float, repeated_s: float = 
 
 def headroom(delay_s: float, delay_margin_s: float) -> float:
     """1 - loop delay / margin; NaN while one of them is unknown, minus infinity if the margin is 0."""
-    return float("-inf") if delay_margin_s <= 0 else 1.0 - delay_s / delay_margin_s
+    return -inf if delay_margin_s <= 0 else 1.0 - delay_s / delay_margin_s
 
 
 class Repetitions:
@@ -50,13 +53,14 @@ class Repetitions:
     def __init__(self, rates: Rates, vehicles: int) -> None:
         ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
         self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
-        self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
+        self._never_s = np.zeros(vehicles)
+        self._used_ns, self._first_ns = np.zeros(vehicles, np.int64), np.zeros(vehicles, np.int64)
         """For each vehicle the instant of the state used last, and the tick that used it first."""
 
-    def repeated_s(self, used_ns: Sequence[int], due_ns: int) -> list[float]:
+    def repeated_s(self, used_ns: NDArray[np.int64], due_ns: int) -> FloatArray:
         """Times from the first tick that used each state to the tick due now, at most one period of the telemetry."""
         if self._longest_ns == 0:
-            return [0.0] * len(used_ns)
-        both = zip(used_ns, self._first, strict=True)
-        self._first = [(now, due_ns) if now != before else (before, first_ns) for now, (before, first_ns) in both]
-        return [min(due_ns - first_ns, self._longest_ns) * 1e-9 for _, first_ns in self._first]
+            return self._never_s
+        self._first_ns[used_ns != self._used_ns] = due_ns
+        self._used_ns = used_ns.copy()
+        return np.minimum(due_ns - self._first_ns, self._longest_ns) * 1e-9

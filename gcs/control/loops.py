@@ -9,16 +9,25 @@ delay counts from that instant; nothing is extrapolated, unless the station pred
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
 from gains.sampled.onboard import own_part
 from gcs.control.acted import ActiveTargets
 from gcs.control.history import Reports
-from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
+from gcs.control.law import FeedbackLaw, VehicleLaw, commands_at, commands_of, feedback_law, formation_control
 from gcs.control.predicted_stream import StreamPrediction
 from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.control.responding import Responding
-from gcs.link import mavlink
+from gcs.link.mavlink import (
+    IGNORE_ALL_BUT_ACCELERATION,
+    IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION,
+    SET_POINT,
+)
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
+from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
@@ -35,15 +44,15 @@ class Moment(NamedTuple):
     """Factor on the formation's spacing."""
 
 
-class Order(NamedTuple):
-    """What a set-point is made from: one vehicle at one tick."""
+class Orders(NamedTuple):
+    """What the set-points of a tick are made from."""
 
-    control: VehicleControl
-    commanded: bool
-    """Whether the vehicle is to follow the control law at this tick."""
-    nominal_velocity_m_s: Vector
-    key_ms: int
-    """The set-point's time_boot_ms."""
+    controls: Records
+    """Of `gcs.control.law.CONTROL`, for each vehicle."""
+    commanded: NDArray[np.bool_]
+    """Whether each vehicle is to follow the control law at this tick."""
+    nominal_velocity_m_s: Vector | FloatArray
+    """Of all vehicles, or of each (n, 2)."""
     due_ns: int
 
 
@@ -54,7 +63,7 @@ class Loop(Protocol):
         """The station's share of each vehicle's command, without the lost ones: see `law.feedback_law`."""
         ...
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         """Errors of every vehicle at a tick, and the acceleration it is sent: see `law.formation_control`."""
         ...
 
@@ -62,16 +71,16 @@ class Loop(Protocol):
         """Take in the one-way delay that was measured for a vehicle, of a message sent at `sent_ns`."""
         ...
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        """Fields of the set-point that carries a command."""
+    def set_points(self, orders: Orders) -> Records:
+        """The set-points (n, SET_POINT) that carry the commands of those vehicles that follow them."""
         ...
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         """Take in the acceleration that a vehicle is sent."""
         ...
 
-    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None:
-        """Take in the fields of a set-point as it was sent."""
+    def sent(self, due_ns: int, points: Records) -> None:
+        """Take in the set-points as they were sent."""
         ...
 
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
@@ -100,7 +109,7 @@ class GroundLoop:
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         return formation_control(
             history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
         )
@@ -108,17 +117,17 @@ class GroundLoop:
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Nothing to do: the newest states are fed back as they are."""
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         """Nothing to do either."""
 
-    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None: ...
+    def sent(self, due_ns: int, points: Records) -> None: ...
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        north, east = order.control.command_m_s2
-        return mavlink.acceleration_set_point(
-            key_ms=order.key_ms, target_system=system_id, north_m_s2=north, east_m_s2=east
-        )
+    def set_points(self, orders: Orders) -> Records:
+        points = np.zeros(len(orders.controls), SET_POINT)
+        points["sent"], points["type_mask"] = orders.commanded, IGNORE_ALL_BUT_ACCELERATION
+        points["acceleration_ne_m_s2"] = orders.controls["command_m_s2"]
+        return points
 
     def parameters(self, system_id: int) -> dict[str, float]:
         del system_id
@@ -129,7 +138,7 @@ class PredictingGroundLoop:
     """The ground loop, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
 
     def __init__(self, plan: FlightPlan) -> None:
-        self._ground, self._row = GroundLoop(plan), plan.formation.row
+        self._ground = GroundLoop(plan)
         self.law, self.parameters = self._ground.law, self._ground.parameters
         vehicles = range(plan.model.vehicles)
         every = plan.responses_in_order
@@ -140,28 +149,27 @@ class PredictingGroundLoop:
         self._deliveries = _deliveries(plan)
         self._states = PredictedStates(self._sent, self._deliveries, plan.timing)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
-        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         controls = self._ground.control(history, law, blends, now)
-        for row, (acts_ns, assumed_s) in enumerate(self._states.look(history, now.due_ns)):
-            own = law[row]
-            if own is not None and acts_ns > 0:
-                command = command_at(self._states, own, row, acts_ns, blends[row], nominal_m_s, opening)
-                controls[row] = controls[row]._replace(command_m_s2=command, assumed_s=assumed_s, acts_ns=acts_ns)
+        acts_ns, assumed_s = self._states.look(history, now.due_ns)
+        commands = commands_at(self._states, law, acts_ns, blends, now.nominal_velocity_m_s, now.opening)
+        _replace(controls, (acts_ns > 0) & _flown(law), command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
         return controls
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         self._deliveries[row].measured(down_ns, sent_ns)
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        self.remember(self._row(system_id), order.due_ns, order.control.command_m_s2)
-        return self._ground.set_point(system_id, order)
+    def set_points(self, orders: Orders) -> Records:
+        _remember_all(self, orders)
+        return self._ground.set_points(orders)
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         self._sent[row].add(due_ns, acceleration_m_s2)
 
-    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None:
-        self._targets[row].sent(due_ns, fields)
+    def sent(self, due_ns: int, points: Records) -> None:
+        velocities, accelerations = points["velocity_ned_m_s"].tolist(), points["acceleration_ne_m_s2"].tolist()
+        for row in np.flatnonzero(points["sent"]).tolist():
+            self._targets[row].sent(due_ns, velocities[row][:2], accelerations[row])
 
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
         self._targets[row].reported(at_ns, fields)
@@ -173,51 +181,45 @@ class StreamedLoop:
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
         own, model = own_part(plan.model, plan.gain), plan.model
-        self._opened_m_s2 = [(0.0, 0.0)] * model.vehicles
+        self._opened_m_s2 = np.zeros((model.vehicles, 2))
         """K_ii^p times the offset: added when the spacing is doubled, which the vehicle's own loop does not know."""
         for i in model.followers:
             on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
-            north, east = (on_spacing @ plan.formation.offset_ne_m[i]).tolist()
-            self._opened_m_s2[i] = north, east
+            self._opened_m_s2[i] = on_spacing @ plan.formation.offset_ne_m[i]
 
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost, returning))
         return feedback_law(self._plan.formation, streamed, lost, returning)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
         controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_m_s, opening=opening)
-        for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
-            control = controls[row]
-            used_ns = _oldest_needed(history, own)
-            if own is not None and used_ns not in (0, control.sample_ns):
-                command = command_at(history, own, row, used_ns, blend, nominal_m_s, opening)
-                control = control._replace(command_m_s2=command, used_ns=used_ns)
-            controls[row] = self.opened(row, control, control.command_m_s2, opening)
+        used_ns = np.array([_oldest_needed(history, own) for own in law.vehicles])
+        commands = commands_at(history, law, used_ns, blends, nominal_m_s, opening)
+        others = (used_ns > 0) & (used_ns != controls["sample_ns"])
+        _replace(controls, others & _flown(law), command_m_s2=commands, used_ns=used_ns)
+        self.open(controls["command_m_s2"], opening)
         return controls
 
-    def opened(self, row: int, control: VehicleControl, command_m_s2: Vector, opening: float) -> VehicleControl:
-        """The control with this command and what a wider spacing adds, of which the vehicle knows nothing."""
-        (north, east), (more_north, more_east) = command_m_s2, self._opened_m_s2[row]
-        command = north + (opening - 1.0) * more_north, east + (opening - 1.0) * more_east
-        return control._replace(command_m_s2=command)
+    def open(self, commands_m_s2: FloatArray, opening: float) -> None:
+        """Add to commands (n, 2) what a wider spacing takes, of which the vehicles know nothing."""
+        commands_m_s2 += (opening - 1.0) * self._opened_m_s2
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Nothing to do: nothing is predicted."""
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         """Nothing to do either."""
 
-    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None: ...
+    def sent(self, due_ns: int, points: Records) -> None: ...
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        return mavlink.velocity_set_point(
-            key_ms=order.key_ms,
-            target_system=system_id,
-            velocity_ned_m_s=(*order.nominal_velocity_m_s, 0.0),
-            acceleration_ne_m_s2=order.control.command_m_s2,
-        )
+    def set_points(self, orders: Orders) -> Records:
+        points = np.zeros(len(orders.controls), SET_POINT)
+        points["sent"], points["type_mask"] = orders.commanded, IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION
+        points["velocity_ned_m_s"][:, :2] = orders.nominal_velocity_m_s
+        points["acceleration_ne_m_s2"] = orders.controls["command_m_s2"]
+        return points
 
     def parameters(self, system_id: int) -> dict[str, float]:
         formation = self._plan.formation
@@ -228,35 +230,58 @@ class PredictingStreamedLoop:
     """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.predicted_stream`)."""
 
     def __init__(self, plan: FlightPlan) -> None:
-        self._streamed, self._row = StreamedLoop(plan), plan.formation.row
+        self._streamed = StreamedLoop(plan)
         self.law, self.parameters = self._streamed.law, self._streamed.parameters
         self.sent, self.active = self._streamed.sent, self._streamed.active
         self._prediction = StreamPrediction(plan, _deliveries(plan))
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         controls = self._streamed.control(history, law, blends, now)
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
         self._prediction.look(history, law, now.due_ns, nominal_m_s)
-        for row, own in enumerate(law):
-            found = None if own is None else self._prediction.states(row)
-            if own is not None and found is not None:
-                acts_ns, assumed_s, states = found
-                command = command_at(states, own, row, acts_ns, blends[row], nominal_m_s, opening)
-                used_ns = self._prediction.used_ns(row)
-                control = controls[row]._replace(used_ns=used_ns, assumed_s=assumed_s, acts_ns=acts_ns)
-                controls[row] = self._streamed.opened(row, control, command, opening)
+        own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.packed.source), 4))
+        acts_ns, assumed_s = np.zeros(len(controls), np.int64), np.zeros(len(controls))
+        for row, vehicle_law in enumerate(law.vehicles):
+            found = None if vehicle_law is None else self._prediction.states(row)
+            if vehicle_law is not None and found is not None:
+                acts_ns[row], assumed_s[row], states = found
+                first = law.packed.begin[row]
+                own[row] = states[row]
+                seen[first : first + len(vehicle_law.terms)] = [states[term.source] for term in vehicle_law.terms]
+        commands = commands_of(law, own, seen, blends, nominal_m_s, opening)
+        self._streamed.open(commands, opening)
+        used_ns = np.array([self._prediction.used_ns(row) for row in range(len(controls))])
+        _replace(
+            controls, acts_ns > 0, command_m_s2=commands, used_ns=used_ns, assumed_s=assumed_s, acts_ns=acts_ns
+        )  # fmt: skip
         return controls
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         self._prediction.deliveries[row].measured(down_ns, sent_ns)
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        self.remember(self._row(system_id), order.due_ns, order.control.command_m_s2)
-        return self._streamed.set_point(system_id, order)
+    def set_points(self, orders: Orders) -> Records:
+        _remember_all(self, orders)
+        return self._streamed.set_points(orders)
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         del due_ns  # that of the tick begun
         self._prediction.remember(row, acceleration_m_s2)
+
+
+def _replace(controls: Records, which: NDArray[np.bool_], **fields: NDArray[Any]) -> None:
+    """Replace fields of some of the controls."""
+    for name, values in fields.items():
+        controls[name][which] = values[which]
+
+
+def _flown(law: FeedbackLaw) -> NDArray[np.bool_]:
+    return np.array([own is not None for own in law.vehicles])
+
+
+def _remember_all(loop: Loop, orders: Orders) -> None:
+    commands = orders.controls["command_m_s2"].tolist()
+    for row in np.flatnonzero(orders.commanded).tolist():
+        loop.remember(row, orders.due_ns, commands[row])
 
 
 def _deliveries(plan: FlightPlan) -> list[Delivery]:

@@ -14,18 +14,19 @@ none is added for it, and errors grow in its turns.
 
 from collections.abc import Sequence
 from math import nan
-from typing import Any
 
-from gcs.control.history import Report, Reports, State
-from gcs.control.law import Blend, FeedbackLaw, VehicleControl
-from gcs.control.loops import Loop, Moment, Order, Vector, steady_loop
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gcs.control.history import Instants, Report, Reports, State, each_at
+from gcs.control.law import FeedbackLaw
+from gcs.control.loops import Loop, Moment, Orders, steady_loop
 from gcs.control.own_law import FlownLaw, OwnLawLoop
 from gcs.plan.course import PlannedMotion
 from gcs.plan.flight_plan import FlightPlan
+from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
-
-_ACCELERATION = slice(7, 9)
-"""North and east among the fields of SET_POSITION_TARGET_LOCAL_NED."""
 
 
 def loop_of(plan: FlightPlan, law: FlownLaw | None = None) -> Loop:
@@ -45,23 +46,21 @@ class ManoeuvringLoop:
         vehicles = range(plan.model.vehicles)
         self._down_ns = [0 for _ in vehicles]
         self._half_period_ns = round(plan.timing.step_s * NS_PER_S / 2.0)
-        self._planned: list[tuple[Vector, Vector]] = [((0.0, 0.0), (0.0, 0.0)) for _ in vehicles]
+        self._velocity_m_s, self._more_m_s2 = (np.zeros((plan.model.vehicles, 2)) for _ in range(2))
         """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
         self.law, self.parameters = inner.law, inner.parameters
         self.sent, self.active = inner.sent, inner.active  # they look at differences, in which the plan cancels
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion
         controls = self._inner.control(_RelativeStates(self, history, now), law, blends, still)
-        for row, control in enumerate(controls):
-            acts_s = now.time_s + (self._down_ns[row] + self._half_period_ns) * 1e-9
-            _, velocity, more = self._motion.reference(row, acts_s, now.opening)
-            self._planned[row] = velocity, more
-            north, east = control.command_m_s2
-            command = (nan, nan) if self.follows_another and row == 0 else (north + more[0], east + more[1])
-            newest = history.newest(row)
-            state = control.state if newest is None else newest[1]
-            controls[row] = control._replace(state=state, command_m_s2=command)
+        for row, down_ns in enumerate(self._down_ns):
+            acts_s = now.time_s + (down_ns + self._half_period_ns) * 1e-9
+            _, self._velocity_m_s[row], self._more_m_s2[row] = self._motion.reference(row, acts_s, now.opening)
+        controls["command_m_s2"] += self._more_m_s2
+        if self.follows_another:
+            controls["command_m_s2"][0] = nan
+        controls["state"] = history.every_newest()[1]
         return controls
 
     def relative(self, row: int, state: State, time_s: float, opening: float, leader: State | None) -> State:
@@ -82,17 +81,17 @@ class ManoeuvringLoop:
         self._down_ns[row] = down_ns
         self._inner.delivered(row, down_ns, sent_ns)
 
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
-        (_, (more_north, more_east)), (north, east) = self._planned[row], acceleration_m_s2
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
+        (more_north, more_east), (north, east) = self._more_m_s2[row].tolist(), acceleration_m_s2
         self._inner.remember(row, due_ns, (north - more_north, east - more_east))
 
-    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        """The inner loop's set-point, made from its own part of the command, with the planned part added."""
-        velocity, (more_north, more_east) = self._planned[self._row(system_id)]
-        north, east = order.control.command_m_s2
-        own = order.control._replace(command_m_s2=(north - more_north, east - more_east))
-        fields = self._inner.set_point(system_id, order._replace(control=own, nominal_velocity_m_s=velocity))
-        return (*fields[: _ACCELERATION.start], north, east, *fields[_ACCELERATION.stop :])
+    def set_points(self, orders: Orders) -> Records:
+        """The inner loop's set-points, made from its own part of the commands, with the planned part added."""
+        own = orders.controls.copy()
+        own["command_m_s2"] -= self._more_m_s2
+        points = self._inner.set_points(orders._replace(controls=own, nominal_velocity_m_s=self._velocity_m_s))
+        points["acceleration_ne_m_s2"] = orders.controls["command_m_s2"]
+        return points
 
 
 class _RelativeStates:
@@ -108,6 +107,16 @@ class _RelativeStates:
     def at(self, vehicle: int, time_ns: int) -> State | None:
         state = self._history.at(vehicle, time_ns)
         return None if state is None else self._relative(vehicle, state, time_ns)
+
+    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
+        return each_at(self, vehicles.tolist(), times_ns.tolist())
+
+    def every_newest(self) -> tuple[Instants, FloatArray]:
+        times_ns, states = self._history.every_newest()
+        for row in np.flatnonzero(times_ns).tolist():
+            north, east, v_north, v_east = states[row].tolist()
+            states[row] = self._relative(row, (north, east, v_north, v_east), times_ns.item(row))
+        return times_ns, states
 
     def _relative(self, vehicle: int, state: State, instant_ns: int) -> State:
         leader = self._history.at(0, instant_ns) if self._loop.follows_another else None

@@ -16,10 +16,11 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import Reports
-from gcs.control.law import Blend, FeedbackLaw, VehicleControl, feedback_law, formation_control
+from gcs.control.law import FeedbackLaw, feedback_law, formation_control
 from gcs.control.loops import GroundLoop, Moment
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import LawFormation, accelerations, law_formation
+from scenarios.kernel import Records
 
 BUDGET_SHARE = 0.2
 """Share of the control period that a call of a law may take."""
@@ -100,7 +101,7 @@ class OwnLawLoop:
 
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
         ground, self._plan, self._law = GroundLoop(plan), plan, law
-        self.delivered, self.remember, self.set_point = ground.delivered, ground.remember, ground.set_point
+        self.delivered, self.remember, self.set_points = ground.delivered, ground.remember, ground.set_points
         self.parameters, self.sent, self.active = ground.parameters, ground.sent, ground.active
         self._known: tuple[Vector, float] | None = None
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
@@ -109,31 +110,23 @@ class OwnLawLoop:
         """The law with zero gains: it gives the spacing errors and says who is lost."""
         return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost, returning)
 
-    def control(
-        self,
-        history: Reports,
-        law: FeedbackLaw,
-        blends: Sequence[Blend],
-        now: Moment,
-    ) -> list[VehicleControl]:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
         controls = formation_control(history, law, blends, nominal_velocity_m_s=velocity_m_s, opening=opening)
-        flown = [row for row, own in enumerate(law) if own is not None]
-        instant_ns = min((controls[row].sample_ns for row in flown), default=0)
+        flown = np.array([own is not None for own in law.vehicles])
+        instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0
         if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
-            return [control._replace(command_m_s2=(nan, nan)) for control in controls]
-        states = np.full((len(law), 4), nan)
-        for row in flown:
-            states[row] = history.at(row, instant_ns)
+            controls["command_m_s2"] = nan
+            return controls
+        states = np.full((len(flown), 4), nan)
+        states[flown] = history.every_at(np.flatnonzero(flown), np.full(flown.sum(), instant_ns))
         if self._known != (velocity_m_s, opening):
             self._known = velocity_m_s, opening
             period_s = self._plan.timing.step_s
             self._formation = law_formation(self._plan.formation, velocity_m_s, period_s, opening)
-        commands = self._law.commands(time_s, states, self._formation)
-        return [
-            control if own is None else control._replace(command_m_s2=command, used_ns=instant_ns)
-            for control, own, command in zip(controls, law, commands, strict=True)
-        ]
+        commands = np.array(self._law.commands(time_s, states, self._formation))
+        controls["command_m_s2"][flown], controls["used_ns"][flown] = commands[flown], instant_ns
+        return controls
 
 
 def _is_usable(command: Vector) -> bool:

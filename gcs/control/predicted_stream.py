@@ -33,17 +33,6 @@ _GRID_S = 1e-3
 """Exponentials are computed for whole milliseconds; a second-order series adds the rest: within 1e-9 at 20 1/s."""
 
 
-class Places:
-    """Where vehicles are at one instant, relative to the leader: `gcs.control.history.States` for the control law."""
-
-    def __init__(self, states: Sequence[State]) -> None:
-        self._states = states
-
-    def at(self, vehicle: int, time_ns: int) -> State:
-        del time_ns
-        return self._states[vehicle]
-
-
 class StreamPrediction:
     """What was sent to each vehicle, and the state of the formation that follows from it."""
 
@@ -64,12 +53,12 @@ class StreamPrediction:
         self._inputs: list[FloatArray] = []
         """u at each tick (vehicles, 2), held until the next."""
         self._streamed, self._sent_ns = np.zeros((model.vehicles, 2)), [0] * model.vehicles
-        self._needs: tuple[FeedbackLaw, list[list[int]]] = (), []
+        self._needs: tuple[FeedbackLaw, list[list[int]]] = FeedbackLaw(()), []
 
     def look(self, history: Reports, law: FeedbackLaw, due_ns: int, nominal_m_s: Sequence[float]) -> None:
         """Begin a tick: what was sent to each vehicle goes on until `remember` says otherwise."""
         if self._needs[0] is not law:
-            self._needs = law, [self._needed(own) for own in law]
+            self._needs = law, [self._needed(own) for own in law.vehicles]
         self._now_ns, self._history = due_ns, history
         target = np.array(nominal_m_s) - self._origin_m_s
         if self._due_ns:
@@ -101,15 +90,15 @@ class StreamPrediction:
         newest = [self._history.newest(k) for k in self._needs[1][row]]
         return min((0 if report is None else report[0] for report in newest), default=0)
 
-    def states(self, row: int) -> tuple[int, float, Places] | None:
-        """When a vehicle's set-point acts (ns), the assumed loop delay (s), and the states at that instant.
+    def states(self, row: int) -> tuple[int, float, list[State]] | None:
+        """When a vehicle's set-point acts (ns), the assumed loop delay (s), and all states then, seen from the leader.
 
         None while a state or a delivery delay is unknown, or a vehicle whose motion matters is lost.
         """
         model, needed, used_ns = self._model, self._needs[1][row], self.used_ns(row)
         delays = [self._delivery_ns[k] for k in needed]
         own_ns = self._delivery_ns[row]
-        if own_ns is None or not used_ns or any(self._needs[0][k] is None for k in needed):
+        if own_ns is None or not used_ns or any(self._needs[0].vehicles[k] is None for k in needed):
             return None
         z = np.zeros(model.states)
         seen = {k: self._history.at(k, used_ns) or (0.0, 0.0, 0.0, 0.0) for k in needed}
@@ -127,7 +116,7 @@ class StreamPrediction:
         z = self._flow.carried(z - before, acts_ns - used_ns) + after
         return acts_ns, (self._age_ns[row] + own_ns) * 1e-9, self._places(z, needed)
 
-    def _places(self, z: FloatArray, needed: Sequence[int]) -> Places:
+    def _places(self, z: FloatArray, needed: Sequence[int]) -> list[State]:
         model, (north_m_s, east_m_s) = self._model, self._origin_m_s.tolist()
         states: list[State] = [(0.0, 0.0, north_m_s, east_m_s)] * model.vehicles
         for k in needed:
@@ -138,7 +127,7 @@ class StreamPrediction:
                 p_north, p_east = z[model.spacing_slice(k)].tolist()
                 north, east = ahead[0] + off_north - p_north, ahead[1] + off_east - p_east
             states[k] = north, east, v_north + north_m_s, v_east + east_m_s
-        return Places(states)
+        return states
 
     def _response(self, vehicle: int, time_ns: int) -> FloatArray:
         """X_i at a time."""

@@ -20,8 +20,12 @@ from collections.abc import Sequence
 from math import ceil, exp
 from typing import NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
 from gains.sampled.multirate import Timing
-from gcs.control.history import Reports, State, StateHistory
+from gcs.control.history import Instants, Reports, State, StateHistory, each_at
 from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
 
@@ -93,7 +97,7 @@ class CommandHistory:
         self._known = 1
         """How many set-points, from the oldest on, have an up-to-date motion."""
 
-    def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None:
+    def add(self, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         """Remember the set-point of a tick; ticks come in order."""
         self._settle()
         self._sent.append(self._after(self._sent[-1], _Sent(due_ns, complex(*acceleration_m_s2), self._responds.rest)))
@@ -246,20 +250,22 @@ class PredictedStates:
         self._delivery_ns: list[int | None] = [None] * len(sent)
         self._history: Reports = StateHistory(len(sent))
 
-    def look(self, history: Reports, due_ns: int) -> list[tuple[int, float]]:
+    def look(self, history: Reports, due_ns: int) -> tuple[Instants, FloatArray]:
         """Take in the newest states. Returns when each vehicle's set-point acts (ns) and the assumed loop delay (s).
 
         Both are 0 while its state or D is unknown.
         """
         self._history = history
-        found: list[tuple[int, float]] = []
+        n = len(self.deliveries)
+        acts_ns, assumed_s = np.zeros(n, np.int64), np.zeros(n)
         for row, delivery in enumerate(self.deliveries):
             newest = history.newest(row)
             age_ns = 0 if newest is None else self._first_uses[row].age_ns(newest[0], due_ns)
             delivery_ns = None if newest is None else delivery.assumed_ns(due_ns, age_ns)
             self._delivery_ns[row] = delivery_ns
-            found.append((0, 0.0) if delivery_ns is None else (due_ns + delivery_ns, (age_ns + delivery_ns) * 1e-9))
-        return found
+            if delivery_ns is not None:
+                acts_ns[row], assumed_s[row] = due_ns + delivery_ns, (age_ns + delivery_ns) * 1e-9
+        return acts_ns, assumed_s
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing."""
@@ -268,3 +274,6 @@ class PredictedStates:
             return self._history.at(vehicle, time_ns)
         sample_ns, state = newest
         return carried(self._sent[vehicle], state, sample_ns - delivery_ns, time_ns - delivery_ns)
+
+    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
+        return each_at(self, vehicles.tolist(), times_ns.tolist())

@@ -10,7 +10,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from gcs.control.tick import Event
-from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep
+from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep, prepare
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
 from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
@@ -52,6 +52,7 @@ def fly(
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
+        prepare(plan)
         # Contexts end in reverse: first the vehicles, then the observer finishes the recording.
         with _observer(folder, viewer, show_table=show_table) as observer, contextlib.ExitStack() as started:
             vehicles: VehicleProcess | None = None

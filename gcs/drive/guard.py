@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram, Outgoing
-from gcs.station.station import ANOTHER_ADDRESS
+from gcs.station.reception import ANOTHER_ADDRESS
 from scenarios.signing.keys import Key, read_key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps, open_stamps

@@ -8,6 +8,7 @@ a socket; the station decides nothing in between.
 import gc
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Protocol
@@ -18,6 +19,7 @@ from gcs.drive.guard import Guard
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
+from scenarios.keys.link import Links
 from scenarios.schema import Scenario
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
@@ -33,6 +35,7 @@ _HOST = "virtual"
 _FLIGHTS_A_COLLECTION = 100
 """Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
 _flights = count(1)
+_TICKS_TO_PREPARE = 10
 
 Sent = list[tuple[int, bytes, int]]
 """Datagrams as (system id, bytes, time in ns)."""
@@ -97,6 +100,32 @@ def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
     links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())
     vehicles = Fleet(plan.scenario, START_NS, signed=links)
     return vehicles, Guard(key, epoch_ns=EPOCH_NS, stamps=Stamps())
+
+
+@dataclass
+class _Joining:
+    """Vehicles that send what the station gets at once from one of them as one datagram, as real ones may."""
+
+    vehicles: Vehicles
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        joined: dict[int, tuple[int, bytes, int]] = {}
+        for system_id, data, time_ns in self.vehicles.step(received, now_ns):
+            joined[system_id] = system_id, joined.get(system_id, (0, b"", 0))[1] + data, time_ns
+        return [*joined.values()]
+
+
+def prepare(plan: FlightPlan) -> None:
+    """Fly the beginning of a plan with plain vehicles and links, so that nothing needs to be compiled in real time."""
+    plain = {"dynamics": "double_integrator", "links": Links(), "response": None}
+    control = plan.scenario.control.model_copy(update={"execute_at": False})
+    scenario = plan.scenario.model_copy(update=plain | {"control": control})
+    station = Station(replace(plan, scenario=scenario, law=None, responses=None), start_ns=START_NS)
+    flown, vehicles = 0, _Joining(vehicles_of(scenario))
+    for _ in fly_lockstep(station.plan, station=station, vehicles=vehicles):
+        flown += station.phase is Phase.FLYING
+        if flown == _TICKS_TO_PREPARE:
+            return
 
 
 def fly_lockstep(

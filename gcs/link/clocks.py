@@ -45,6 +45,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scenarios.kernel import Cell, Columns, Record, Records, kernel
 from scenarios.schema import DRIFT_MAX_PPM
 
 WINDOW = 128
@@ -54,6 +55,8 @@ LEAST_SAMPLES = 5
 LATEST_NS = 1 << 62
 """Largest plausible clock reading, 146 years; a clock set back may be negative. Differences fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
+_MOST_PENDING = 4096
+"""Most requests that are remembered without a reply: 20 s at 200 Hz."""
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
@@ -81,9 +84,50 @@ _WANDER = 10e-6
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 5
 """After the first samples the line is fitted at every fifth only, to save time, and extrapolated in between."""
+UNKNOWN = -1
+"""In place of a duration that is not known."""
 _Floats = NDArray[np.float64]
-_sum = np.add.reduce
-"""np.sum, at half its cost for so few samples."""
+
+CLOCK = np.dtype(
+    [
+        # the estimate: see `ClockEstimate`
+        ("samples", "i8"), ("offset_ns", "i8"), ("skew", "f8"), ("bound_ns", "i8"), ("reference_ns", "i8"),
+        ("jumps", "i8"),
+        ("rtt_ns", "i8"),  # round trip of the newest exchange, or UNKNOWN
+        ("down_ns", "i8"),  # one-way delay from station to vehicle in it, by the estimated offset, or UNKNOWN
+        ("down_bound_ns", "f8"),  # its largest error
+        ("loop_bound_ns", "f8"),  # largest error that clocks bring into a loop delay: age of newest state + down_ns
+        ("unmatched", "i8"),  # replies to no request
+        ("expected_error_ns", "i8"),  # largest error of stamps that is usual for this kind of vehicle
+        ("stamp_error_ns", "f8"),  # largest error of stamps that contradictions between exchanges have shown
+        ("lost", "?"),  # known to have jumped, but not yet by how much
+        ("asked_ns", "i8"),  # when the last request was sent
+        ("doubtful_state", "?"),
+        ("newest_boot_ns", "i8"),  # boot time of the newest accepted state since the last jump
+        ("count", "i8"),  # exchanges since the last jump
+        ("pending", "i8"),  # requests without a reply
+        ("state_low_ns", "i8"),  # lower limit of the offset by the quickest of the first states
+        ("state_at_ns", "i8"),  # when that was received
+        ("least_ns", "i8"),  # least round trip of the window at the last fit
+        ("unusual_ns", "i8"),  # largest residual then
+        ("ways_ns", "f8"),  # quickest way up plus quickest way down behind the line
+        ("fitted_ns", "i8"),  # when it was fitted
+        ("tilt", "f8"),  # largest error of the line's rate
+        ("low_ns", "i8"), ("low_at_ns", "i8"), ("high_ns", "i8"), ("high_at_ns", "i8"),  # limits of the offset
+        ("in_doubt", "?"),  # whether there was a doubtful exchange and it is not yet decided whether the clock jumped
+        # limits since the first doubtful exchange
+        ("since_low_ns", "i8"), ("since_low_at_ns", "i8"), ("since_high_ns", "i8"), ("since_high_at_ns", "i8"),
+        ("doubtful_gap_ns", "f8"),  # the largest contradiction of these
+        ("ahead_ns", "f8"),  # most by which a state since the newest exchange was sampled after reception, beyond bound
+        ("held_back_ns", "i8"),  # the same within the bound: taken to have been sampled when it was received
+        ("since_ns", "i8"),  # when the first exchange since the last jump was requested
+        ("doubts", "i8"), ("doubts_in_a_row", "i8"),  # how many exchanges were doubtful, and how many in a row
+        ("doubted_ns", "i8"),  # the residual of the first
+    ],
+    align=True,
+)  # fmt: skip
+"""What is known of one vehicle's clock."""
+EXCHANGES = np.dtype([("sent_ns", "i8"), ("rtt_ns", "i8"), ("offset_ns", "i8")])
 
 
 class ClockEstimate(NamedTuple):
@@ -99,22 +143,18 @@ class ClockEstimate(NamedTuple):
     reference_ns: int
 
     def offset_at_ns(self, time_ns: int) -> int:
-        return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
+        return offset_at_ns(self, time_ns)
 
     def bound_at_ns(self, time_ns: int) -> float:
         """The largest error of the offset, or of an instant from `to_station_ns`, near a time of the station."""
-        return self.bound_ns + (DRIFT_BOUND + abs(self.skew)) * abs(time_ns - self.reference_ns)
+        return bound_at_ns(self, time_ns)
 
     def to_station_ns(self, boot_ns: int) -> int:
         """The station's time at an instant of the vehicle's boot clock."""
-        first = boot_ns - self.offset_ns
-        return first - round(self.skew * (first - self.reference_ns))
+        return to_station_ns(self, boot_ns)
 
 
-UNKNOWN = ClockEstimate(samples=0, offset_ns=0, skew=0.0, bound_ns=0, reference_ns=0)
-
-
-class _Limits(NamedTuple):
+class Limits(NamedTuple):
     """Limits of the offset, each with the time at which it holds; in between they move apart by DRIFT_BOUND."""
 
     low_ns: int
@@ -122,321 +162,513 @@ class _Limits(NamedTuple):
     high_ns: int
     high_at_ns: int
 
-    def gap_ns(self, other: "_Limits") -> float:
-        """By how much these limits exclude others, whatever the drift in between; 0 or less if they do not."""
-        return max(
-            other.low_ns - self.high_ns - DRIFT_BOUND * abs(other.low_at_ns - self.high_at_ns),
-            self.low_ns - other.high_ns - DRIFT_BOUND * abs(other.high_at_ns - self.low_at_ns),
-        )
 
-    def joined(self, other: "_Limits", *, tighter: bool) -> "_Limits":
-        """The tighter or the wider of both, compared at the newer time."""
-        pick_low, pick_high = (max, min) if tighter else (min, max)
-        low_at_ns, high_at_ns = max(self.low_at_ns, other.low_at_ns), max(self.high_at_ns, other.high_at_ns)
-        low_ns = pick_low(self.low_at(low_at_ns), other.low_at(low_at_ns))
-        high_ns = pick_high(self.high_at(high_at_ns), other.high_at(high_at_ns))
-        return _Limits(low_ns, low_at_ns, high_ns, high_at_ns)
+@kernel
+def offset_at_ns(known: ClockEstimate, time_ns: int) -> int:
+    return known.offset_ns + round(known.skew * (time_ns - known.reference_ns))
 
-    def low_at(self, time_ns: int) -> int:
-        return self.low_ns - round(DRIFT_BOUND * abs(time_ns - self.low_at_ns))
 
-    def high_at(self, time_ns: int) -> int:
-        return self.high_ns + round(DRIFT_BOUND * abs(time_ns - self.high_at_ns))
+@kernel
+def bound_at_ns(known: ClockEstimate, time_ns: int) -> float:
+    return known.bound_ns + (DRIFT_BOUND + abs(known.skew)) * abs(time_ns - known.reference_ns)
+
+
+@kernel
+def to_station_ns(known: ClockEstimate, boot_ns: int) -> int:
+    first = boot_ns - known.offset_ns
+    return first - round(known.skew * (first - known.reference_ns))
+
+
+@kernel
+def estimate_of(clock: Record) -> ClockEstimate:
+    return ClockEstimate(clock.samples, clock.offset_ns, clock.skew, clock.bound_ns, clock.reference_ns)
+
+
+@kernel
+def _set_estimate(clock: Record, known: ClockEstimate) -> None:
+    clock.samples, clock.offset_ns, clock.skew = known.samples, known.offset_ns, known.skew
+    clock.bound_ns, clock.reference_ns = known.bound_ns, known.reference_ns
+
+
+@kernel
+def _known_limits(clock: Record) -> Limits:
+    return Limits(clock.low_ns, clock.low_at_ns, clock.high_ns, clock.high_at_ns)
+
+
+@kernel
+def _set_limits(clock: Record, limits: Limits) -> None:
+    clock.low_ns, clock.low_at_ns = limits.low_ns, limits.low_at_ns
+    clock.high_ns, clock.high_at_ns = limits.high_ns, limits.high_at_ns
+
+
+@kernel
+def _limits_in_doubt(clock: Record) -> Limits:
+    return Limits(clock.since_low_ns, clock.since_low_at_ns, clock.since_high_ns, clock.since_high_at_ns)
+
+
+@kernel
+def _set_limits_in_doubt(clock: Record, limits: Limits) -> None:
+    clock.since_low_ns, clock.since_low_at_ns = limits.low_ns, limits.low_at_ns
+    clock.since_high_ns, clock.since_high_at_ns = limits.high_ns, limits.high_at_ns
+    clock.in_doubt = True
+
+
+@kernel
+def _low_at(limits: Limits, time_ns: int) -> int:
+    return limits.low_ns - round(DRIFT_BOUND * abs(time_ns - limits.low_at_ns))
+
+
+@kernel
+def _high_at(limits: Limits, time_ns: int) -> int:
+    return limits.high_ns + round(DRIFT_BOUND * abs(time_ns - limits.high_at_ns))
+
+
+@kernel
+def _gap_ns(own: Limits, other: Limits) -> float:
+    """By how much limits exclude others, whatever the drift in between; 0 or less if they do not."""
+    return max(
+        other.low_ns - own.high_ns - DRIFT_BOUND * abs(other.low_at_ns - own.high_at_ns),
+        own.low_ns - other.high_ns - DRIFT_BOUND * abs(other.high_at_ns - own.low_at_ns),
+    )
+
+
+@kernel
+def _joined(own: Limits, other: Limits, tighter: bool) -> Limits:
+    """The tighter or the wider of both, compared at the newer time."""
+    low_at_ns, high_at_ns = max(own.low_at_ns, other.low_at_ns), max(own.high_at_ns, other.high_at_ns)
+    low_ns, other_low_ns = _low_at(own, low_at_ns), _low_at(other, low_at_ns)
+    high_ns, other_high_ns = _high_at(own, high_at_ns), _high_at(other, high_at_ns)
+    if tighter:
+        return Limits(max(low_ns, other_low_ns), low_at_ns, min(high_ns, other_high_ns), high_at_ns)
+    return Limits(min(low_ns, other_low_ns), low_at_ns, max(high_ns, other_high_ns), high_at_ns)
+
+
+@kernel
+def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
+    """Note a request sent now; returns its ts1, unique among the pending requests."""
+    clock.asked_ns = now_ns
+    while _place(clock, pending_ns, now_ns) >= 0:
+        now_ns += 1
+    if clock.pending == len(pending_ns):
+        _drop(clock, pending_ns, 0)
+    pending_ns[clock.pending] = now_ns
+    clock.pending += 1
+    if now_ns - pending_ns[0] > REQUEST_LIFETIME_NS:
+        _drop(clock, pending_ns, 0)
+    return now_ns
+
+
+@kernel
+def _place(clock: Record, pending_ns: NDArray[np.int64], ts1_ns: int) -> int:
+    """The place of a request among those pending, oldest first; -1 if it is not among them."""
+    for place in range(clock.pending - 1, -1, -1):
+        if pending_ns[place] == ts1_ns:
+            return place
+    return -1
+
+
+@kernel
+def _drop(clock: Record, pending_ns: NDArray[np.int64], place: int) -> None:
+    clock.pending -= 1
+    for later in range(place, clock.pending):
+        pending_ns[later] = pending_ns[later + 1]
+
+
+@kernel
+def boot_ns_of(known: ClockEstimate, boot_ms: int, near_ns: int) -> int:
+    """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
+    boot_ns = boot_ms * _BOOT_MS_NS
+    if known.samples == 0:
+        return boot_ns
+    turns = (offset_at_ns(known, near_ns) + near_ns - boot_ns + _WRAP_NS // 2) // _WRAP_NS
+    return boot_ns + turns * _WRAP_NS
+
+
+@kernel
+def sampled_ns(clock: Record, boot_ms: int, received_ns: int, newest: bool) -> int:
+    """The station's time at which a state was sampled; UNKNOWN if it is unknown or impossible.
+
+    `newest` says that its sequence number shows that it was sent after all states received before.
+    """
+    known = estimate_of(clock)
+    if known.samples == 0:
+        return UNKNOWN
+    boot_ns = boot_ns_of(known, boot_ms, received_ns)
+    sample_ns = to_station_ns(known, boot_ns)
+    ahead_ns = sample_ns - received_ns
+    if ahead_ns > 0:
+        beyond_ns = ahead_ns - bound_at_ns(known, sample_ns) - _BOOT_MS_NS
+        if beyond_ns > 0.0:
+            _is_ahead(clock, beyond_ns, received_ns, newest)
+            return UNKNOWN
+        clock.held_back_ns = max(clock.held_back_ns, ahead_ns)
+        sample_ns = received_ns
+    if newest and boot_ns < clock.newest_boot_ns:
+        clock.doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
+        return UNKNOWN
+    if not newest and sample_ns < clock.since_ns:
+        return UNKNOWN  # of the clock before a jump that an exchange has shown: its instant is unknown
+    clock.newest_boot_ns = max(boot_ns, clock.newest_boot_ns)
+    if newest and clock.count < _EVERY_SAMPLE and boot_ns - received_ns > clock.state_low_ns:
+        clock.state_low_ns, clock.state_at_ns = boot_ns - received_ns, received_ns
+    return sample_ns
+
+
+@kernel
+def _is_ahead(clock: Record, beyond_ns: float, received_ns: int, newest: bool) -> None:
+    """Note a state from the future. An overtaken one may bear a stamp from before a jump: it proves nothing."""
+    if newest and beyond_ns > STAMPS_OFF_NS:
+        clock.lost, clock.since_ns, clock.count = True, received_ns, 0
+        clock.samples = clock.offset_ns = clock.bound_ns = clock.reference_ns = 0
+    elif newest:
+        clock.ahead_ns, clock.doubtful_state = max(beyond_ns, clock.ahead_ns), True
+
+
+@kernel
+def reply(
+    clock: Record, exchanges: Records, pending_ns: NDArray[np.int64], tc1_ns: int, ts1_ns: int, received_ns: int
+) -> int:
+    """Take in a reply; returns the round trip in ns, or UNKNOWN if it answers no request or its time is impossible."""
+    place = _place(clock, pending_ns, ts1_ns)
+    if place < 0 or received_ns < ts1_ns or tc1_ns >= LATEST_NS or tc1_ns <= -LATEST_NS:
+        clock.unmatched += 1
+        return UNKNOWN
+    _drop(clock, pending_ns, place)
+    rtt = received_ns - ts1_ns
+    clock.rtt_ns = rtt
+    if ts1_ns < clock.since_ns:
+        return rtt  # from before a jump that a newer exchange has shown
+    clock.doubtful_state = False
+    middle = ts1_ns + rtt // 2
+    offset = tc1_ns - middle
+    own = Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - ts1_ns + _READING_NS, ts1_ns)
+    gap_ns = _gap_ns(_known_limits(clock), own) if clock.count else 0.0
+    if clock.lost or gap_ns > STAMPS_OFF_NS:
+        _jumped(clock, exchanges, ts1_ns, 0)
+    before = estimate_of(clock)
+    if clock.count == 0:
+        _set_limits(clock, own)
+    elif _is_doubtful(clock, offset, rtt, middle, gap_ns):
+        _doubt(clock, own, gap_ns)
+    else:
+        _fit(clock, own)
+    newest = exchanges[clock.count % WINDOW]
+    newest.sent_ns, newest.rtt_ns, newest.offset_ns = middle, rtt, offset
+    clock.count += 1
+    if clock.doubts_in_a_row == SMALL_DOUBTS or (clock.doubts == DOUBTS and clock.doubted_ns > STAMPS_OFF_NS):
+        _jumped(clock, exchanges, ts1_ns, max(clock.doubts_in_a_row, DOUBTS))
+    if clock.doubts == 0 and (clock.count <= _EVERY_SAMPLE or clock.count % _ESTIMATE_EVERY == 0):
+        _estimate(clock, exchanges, middle)
+    _stay_within_limits(clock, middle)
+    _measure_down(clock, tc1_ns, ts1_ns, rtt, before)
+    return rtt
+
+
+@kernel
+def _measure_down(clock: Record, tc1_ns: int, ts1_ns: int, rtt_ns: int, before: ClockEstimate) -> None:
+    """The one-way delay of an exchange, and the largest error of the loop delays that it is used for.
+
+    If the age of a state and this delay use the same offset, its error cancels. What remains is the error of the
+    reply's stamp, the millisecond in which states are stamped, the change of the estimate between the two, and what
+    keeps either of them from being negative.
+    """
+    known = estimate_of(clock)
+    down_ns = to_station_ns(known, tc1_ns) - ts1_ns
+    clock.down_ns = min(rtt_ns, max(0, down_ns))
+    clock.down_bound_ns = bound_at_ns(known, ts1_ns + clock.down_ns)
+    changed_ns = since_ns = 0
+    if before.samples:
+        changed_ns = abs(known.offset_ns - offset_at_ns(before, known.reference_ns))
+        since_ns = known.reference_ns - before.reference_ns
+    clock.loop_bound_ns = (
+        _stamps_off_ns(clock) + _READING_NS + _BOOT_MS_NS
+        + changed_ns + (DRIFT_BOUND + abs(known.skew)) * (since_ns + rtt_ns)
+        + abs(down_ns - clock.down_ns) + clock.held_back_ns
+    )  # fmt: skip
+    clock.held_back_ns = 0
+
+
+@kernel
+def _stamps_off_ns(clock: Record) -> float:
+    """The largest error of a stamp."""
+    shown_ns = clock.stamp_error_ns + clock.least_ns if clock.stamp_error_ns else 0.0
+    return max(float(clock.expected_error_ns), shown_ns)
+
+
+@kernel
+def _explained_ns(clock: Record) -> float:
+    """Contradictions up to this are due to stamps."""
+    return max(float(clock.expected_error_ns), clock.stamp_error_ns)
+
+
+@kernel
+def _doubt(clock: Record, own: Limits, gap_ns: float) -> None:
+    """Keep the limits of a doubtful exchange beside the known ones."""
+    if clock.in_doubt:
+        since = _limits_in_doubt(clock)
+        _set_limits_in_doubt(clock, _joined(since, own, _gap_ns(since, own) <= _explained_ns(clock)))
+    else:
+        _set_limits_in_doubt(clock, own)
+    clock.doubtful_gap_ns = max(gap_ns, clock.doubtful_gap_ns)
+    clock.doubts_in_a_row += 1
+    clock.ahead_ns = 0.0
+
+
+@kernel
+def _fit(clock: Record, own: Limits) -> None:
+    """Narrow the limits by an exchange that fits them, which may show that earlier doubts were errors of stamps."""
+    clock.doubts_in_a_row = 0
+    if clock.ahead_ns:
+        clock.stamp_error_ns, clock.ahead_ns = _explained_ns(clock) + clock.ahead_ns, 0.0
+    if clock.in_doubt:
+        since = _limits_in_doubt(clock)
+        if clock.doubts and _gap_ns(since, own) <= _explained_ns(clock):
+            _set_limits_in_doubt(clock, _joined(since, own, True))
+        else:
+            clock.stamp_error_ns = max(clock.stamp_error_ns, clock.doubtful_gap_ns)
+            clock.in_doubt, clock.doubtful_gap_ns, clock.doubts, clock.doubted_ns = False, 0.0, 0, 0
+    _set_limits(clock, _joined(_known_limits(clock), own, True))
+
+
+@kernel
+def _is_doubtful(clock: Record, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns: float) -> bool:
+    """Whether an exchange contradicts the limits, or is farther off the line than jitter explains; counts such.
+
+    If one way alone became slower by x, so did the round trip, and the offset is off by x / 2.
+    """
+    contradicts = gap_ns > _explained_ns(clock)
+    if clock.count < 2 * LEAST_SAMPLES and not contradicts:
+        return False
+    known = estimate_of(clock)
+    off_ns = abs(offset_ns - offset_at_ns(known, at_ns))
+    explained_ns = abs(rtt_ns - clock.least_ns) / 2 + _UNUSUAL * clock.unusual_ns + _explained_ns(clock)
+    explained_ns += DRIFT_BOUND * abs(at_ns - known.reference_ns) + _DOUBTFUL_NS
+    if contradicts or off_ns > explained_ns:
+        clock.doubts += 1
+        clock.doubted_ns = off_ns if clock.doubts == 1 else clock.doubted_ns
+        return True
+    if explained_ns < clock.doubted_ns:
+        clock.doubts = clock.doubted_ns = 0
+    return False
+
+
+@kernel
+def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
+    """Start over with the newest exchanges.
+
+    A change that stamps may explain is no jump while their error is not known yet: then it is taken for that error.
+    """
+    newest = np.empty((keep, 3), np.int64)
+    for k in range(keep):
+        kept = exchanges[(clock.count - keep + k) % WINDOW]
+        newest[k, 0], newest[k, 1], newest[k, 2] = kept.sent_ns, kept.rtt_ns, kept.offset_ns
+    for k in range(keep):
+        kept = exchanges[k]
+        kept.sent_ns, kept.rtt_ns, kept.offset_ns = newest[k, 0], newest[k, 1], newest[k, 2]
+    if keep == SMALL_DOUBTS and clock.count - keep < _SETTLED and clock.doubtful_gap_ns:
+        clock.stamp_error_ns = max(clock.stamp_error_ns, clock.doubtful_gap_ns)
+    else:
+        clock.jumps += 1
+    if clock.in_doubt:
+        _set_limits(clock, _limits_in_doubt(clock))
+    clock.lost, clock.newest_boot_ns = False, _LONG_AGO_NS
+    clock.in_doubt, clock.doubtful_gap_ns, clock.ahead_ns = False, 0.0, 0.0
+    clock.count, clock.since_ns = keep, ts1_ns
+    clock.ways_ns, clock.tilt, clock.state_low_ns = float(LATEST_NS), _TILT, _LONG_AGO_NS
+    clock.doubts = clock.doubts_in_a_row = clock.doubted_ns = 0
+
+
+@kernel
+def _stay_within_limits(clock: Record, at_ns: int) -> None:
+    """Move the estimate to a time, and between the limits."""
+    known, limits = estimate_of(clock), _known_limits(clock)
+    if clock.in_doubt:
+        limits = _joined(limits, _limits_in_doubt(clock), False)
+    one_ns, other_ns = _low_at(limits, at_ns), _high_at(limits, at_ns)
+    low_ns, high_ns = min(one_ns, other_ns), max(one_ns, other_ns)  # crossed by errors of stamps
+    offset_ns = min(max(offset_at_ns(known, at_ns), low_ns), high_ns)
+    clock.bound_ns = max(high_ns - offset_ns, offset_ns - low_ns) + round(_stamps_off_ns(clock))
+    clock.samples, clock.offset_ns, clock.reference_ns = min(clock.count, WINDOW), offset_ns, at_ns
+
+
+@kernel
+def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
+    """Fit the line to the exchanges of the window."""
+    n, known, ageing = min(clock.count, WINDOW), estimate_of(clock), clock.tilt
+    base = exchanges[(clock.count - 1) % WINDOW].offset_ns
+    rtt, t, y, weight = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    least = exchanges[0].rtt_ns
+    for k in range(n):
+        least = min(least, exchanges[k].rtt_ns)
+    for k in range(n):
+        rtt[k], t[k], y[k] = exchanges[k].rtt_ns, exchanges[k].sent_ns - now_ns, exchanges[k].offset_ns - base
+        excess = exchanges[k].rtt_ns - least + _FLOOR_NS
+        weight[k] = 1.0 / (excess * excess)
+    clock.least_ns = least
+    weight /= _sum(weight)
+    t_mean = _sum(weight * t)
+    weighted = weight * (t - t_mean)
+    spread = _sum(weighted * t)
+    # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
+    # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
+    skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
+    if spread > 0.09e18:
+        skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, _sum(weighted * y) / spread))
+        low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
+        tilt = _sum(np.abs(weighted) * (rtt - (high_ns - low_ns))) / (2.0 * spread)
+    if tilt >= ageing:
+        skew = known.skew
+        low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
+    if clock.state_low_ns > _LONG_AGO_NS:
+        state_t = clock.state_at_ns - now_ns
+        state_ns = clock.state_low_ns - base - skew * state_t
+        low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
+    ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
+    off_ns = max(0.0, _explained_ns(clock) - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
+    if off_ns > 0.0:
+        offset_ns = min(max(_sum(weight * y) - skew * t_mean, offset_ns - off_ns), offset_ns + off_ns)
+        ways_ns = max(ways_ns, float(least))  # this line is only as good as the quickest exchange
+    # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
+    if ways_ns > clock.ways_ns + 2.0 * ageing * (now_ns - clock.fitted_ns) + _FLOOR_NS:
+        skew, offset_ns = known.skew, float(offset_at_ns(known, now_ns) - base)
+    else:
+        clock.ways_ns, clock.fitted_ns = ways_ns, now_ns
+        clock.tilt = min(ageing, tilt + _WANDER)
+    clock.unusual_ns = round(np.abs(y - skew * t - offset_ns).max())
+    _set_estimate(clock, ClockEstimate(n, base + round(offset_ns), skew, 0, now_ns))
+
+
+@kernel
+def _quickest(t: _Floats, y: _Floats, rtt: _Floats, skew: float, ageing: float) -> tuple[float, float]:
+    """Limits of the offset at t = 0 by the quickest way up and the quickest down; they worsen with age."""
+    offset, way, aged = y - skew * t, (0.5 + 0.5 * skew) * rtt, ageing * t
+    low, high = offset - way, offset + way
+    return low[(low + aged).argmax()], high[(high - aged).argmin()]
+
+
+@kernel
+def _sum(values: _Floats) -> float:
+    """The sum of at most 128 values in the order in which numpy adds them, whatever the processor."""
+    n = len(values)
+    if n < 8:
+        total = 0.0
+        for k in range(n):
+            total += values[k]
+        return total
+    a, b, c, d, e, f, g, h = values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7]
+    for k in range(8, n - n % 8, 8):
+        a += values[k]
+        b += values[k + 1]
+        c += values[k + 2]
+        d += values[k + 3]
+        e += values[k + 4]
+        f += values[k + 5]
+        g += values[k + 6]
+        h += values[k + 7]
+    total = ((a + b) + (c + d)) + ((e + f) + (g + h))
+    for k in range(n - n % 8, n):
+        total += values[k]
+    return total
+
+
+@kernel
+def _request_at(clocks: Records, pending_ns: NDArray[np.int64], row: int, now_ns: int) -> int:
+    return request(clocks[row], pending_ns[row], now_ns)
+
+
+@kernel
+def _sampled_at(clocks: Records, row: int, boot_ms: int, received_ns: int, newest: bool) -> int:
+    return sampled_ns(clocks[row], boot_ms, received_ns, newest)
+
+
+@kernel
+def _reply_at(
+    clocks: Records, exchanges: Records, pending_ns: NDArray[np.int64], row: int,
+    tc1_ns: int, ts1_ns: int, received_ns: int,
+) -> int:  # fmt: skip
+    return reply(clocks[row], exchanges[row], pending_ns[row], tc1_ns, ts1_ns, received_ns)
+
+
+class Clocks(NamedTuple):
+    """The clocks of n vehicles."""
+
+    known: Records
+    """Of CLOCK, (n,)."""
+    exchanges: Records
+    """Of EXCHANGES, (n, WINDOW); the newest since the last jump, not in order."""
+    pending_ns: NDArray[np.int64]
+    """ts1 of the requests without a reply, (n, most), oldest first."""
+
+
+def new_clocks(n: int) -> Clocks:
+    """Clocks of which nothing is known."""
+    known = np.zeros(n, CLOCK)
+    known["rtt_ns"] = known["down_ns"] = UNKNOWN
+    known["newest_boot_ns"] = known["state_low_ns"] = known["fitted_ns"] = _LONG_AGO_NS
+    known["ways_ns"], known["tilt"], known["since_ns"] = LATEST_NS, _TILT, -1
+    return Clocks(known, np.zeros((n, WINDOW), EXCHANGES), np.zeros((n, _MOST_PENDING), np.int64))
 
 
 class VehicleClock:
-    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link."""
+    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link: a row of `Clocks`."""
 
-    def __init__(self) -> None:
-        self.estimate = UNKNOWN
-        self.jumps = 0
-        self.rtt_ns: int | None = None
-        """Round trip of the newest exchange."""
-        self.down_ns: int | None = None
-        """One-way delay from station to vehicle in the newest exchange, by the estimated offset."""
-        self.down_bound_ns = 0.0
-        """Its largest error."""
-        self.loop_bound_ns = 0.0
-        """The largest error that the clocks bring into a loop delay: age of the newest state plus `down_ns`."""
-        self.unmatched = 0
-        self.expected_error_ns = 0
-        """The largest error of stamps that is usual for this kind of vehicle."""
-        self.stamp_error_ns = 0.0
-        """The largest error of stamps that contradictions between exchanges have shown."""
-        self.lost = False
-        """Whether the clock is known to have jumped, but not yet by how much."""
-        self.asked_ns = 0
-        """When the last request was sent."""
-        self._doubtful_state = False
-        self._newest_boot_ns = _LONG_AGO_NS
-        """Boot time of the newest accepted state since the last jump."""
-        self._pending: dict[int, None] = {}
-        self._count = 0
-        self._sent_ns, self._rtt_ns, self._offset_ns = (np.zeros(WINDOW, dtype=np.int64) for _ in range(3))
-        self._state_low_ns, self._state_at_ns = _LONG_AGO_NS, 0
-        """Lower limit of the offset by the quickest of the first states, and when that was received."""
-        self._least_ns = self._unusual_ns = 0
-        """Least round trip and largest residual of the window at the last fit."""
-        self._ways_ns, self._fitted_ns = float(LATEST_NS), _LONG_AGO_NS
-        """Quickest way up plus quickest way down behind the line; when it was fitted."""
-        self._tilt = _TILT
-        """The largest error of the line's rate."""
-        self._known = _Limits(0, 0, 0, 0)
-        """Limits of the offset."""
-        self._doubtful: _Limits | None = None
-        """Those since the first doubtful exchange, until it is decided whether the clock has jumped."""
-        self._doubtful_gap_ns = 0.0
-        """The largest contradiction of these."""
-        self._ahead_ns = 0.0
-        """The most by which a state since the newest exchange was sampled after it was received, beyond the bound."""
-        self._held_back_ns = 0
-        """The same within the bound: such a state is taken to have been sampled when it was received."""
-        self._since_ns = -1
-        """When the first exchange since the last jump was requested."""
-        self._doubts = self._doubts_in_a_row = self._doubted_ns = 0
-        """How many exchanges were doubtful, how many of these in a row, and the residual of the first."""
+    samples = Cell[int]()
+    """Exchanges behind the estimate; 0 while the clock is unknown."""
+    jumps = Cell[int]()
+    rtt_ns = Cell[int | None](UNKNOWN)
+    """Round trip of the newest exchange."""
+    down_ns = Cell[int | None](UNKNOWN)
+    """One-way delay from station to vehicle in the newest exchange, by the estimated offset."""
+    down_bound_ns = Cell[float]()
+    """Its largest error."""
+    loop_bound_ns = Cell[float]()
+    """The largest error that the clocks bring into a loop delay: age of the newest state plus `down_ns`."""
+    unmatched = Cell[int]()
+    """Replies to no request."""
+    expected_error_ns = Cell[int]()
+    """The largest error of stamps that is usual for this kind of vehicle."""
+    stamp_error_ns = Cell[float]()
+    """The largest error of stamps that contradictions between exchanges have shown."""
 
-    def request(self, now_ns: int) -> int:
-        """Note a request sent now; returns its ts1, unique among the pending requests."""
-        self.asked_ns = now_ns
-        while now_ns in self._pending:
-            now_ns += 1
-        self._pending[now_ns] = None
-        oldest = next(iter(self._pending))
-        if now_ns - oldest > REQUEST_LIFETIME_NS:
-            del self._pending[oldest]
-        return now_ns
+    def __init__(self, clocks: Clocks | None = None, row: int = 0) -> None:
+        self._clocks, self._row = clocks or new_clocks(1), row
+        self._columns = Columns(self._clocks.known)
+
+    @property
+    def estimate(self) -> ClockEstimate:
+        return ClockEstimate(*(self._columns[name][self._row] for name in ClockEstimate._fields))
+
+    @estimate.setter
+    def estimate(self, estimate: ClockEstimate) -> None:
+        for name, value in zip(ClockEstimate._fields, estimate, strict=True):
+            self._clocks.known[name][self._row] = value
 
     @property
     def exchange_due(self) -> bool:
         """Whether a state was refused since the newest exchange, so that the next exchange must not wait."""
-        return self.lost or self._doubtful_state
+        return bool(self._columns["lost"][self._row] or self._columns["doubtful_state"][self._row])
+
+    def request(self, now_ns: int) -> int:
+        """Note a request sent now; returns its ts1, unique among the pending requests."""
+        return _request_at(self._clocks.known, self._clocks.pending_ns, self._row, now_ns)
 
     def boot_ns(self, boot_ms: int, near_ns: int) -> int:
         """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
-        boot_ns = boot_ms * _BOOT_MS_NS
-        if self.estimate.samples == 0:
-            return boot_ns
-        turns = (self.estimate.offset_at_ns(near_ns) + near_ns - boot_ns + _WRAP_NS // 2) // _WRAP_NS
-        return boot_ns + turns * _WRAP_NS
+        return boot_ns_of(self.estimate, boot_ms, near_ns)
 
     def station_ns(self, boot_ms: int, received_ns: int) -> int | None:
         """The station's time of a time_boot_ms, not used to judge the clock; None while the clock is unknown."""
-        if self.estimate.samples == 0:
+        if not self.samples:
             return None
-        return min(received_ns, self.estimate.to_station_ns(self.boot_ns(boot_ms, received_ns)))
+        known = self.estimate
+        return min(received_ns, known.to_station_ns(boot_ns_of(known, boot_ms, received_ns)))
 
     def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
-        """The station's time at which a state was sampled; None if it is unknown or impossible.
-
-        `newest` says that its sequence number shows that it was sent after all states received before.
-        """
-        known = self.estimate
-        if known.samples == 0:
-            return None
-        boot_ns = self.boot_ns(boot_ms, received_ns)
-        sample_ns = known.to_station_ns(boot_ns)
-        ahead_ns = sample_ns - received_ns
-        if ahead_ns > 0:
-            beyond_ns = ahead_ns - known.bound_at_ns(sample_ns) - _BOOT_MS_NS
-            if beyond_ns > 0.0:
-                self._is_ahead(beyond_ns, received_ns, newest=newest)
-                return None
-            self._held_back_ns = max(self._held_back_ns, ahead_ns)
-            sample_ns = received_ns
-        if newest and boot_ns < self._newest_boot_ns:
-            self._doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
-            return None
-        if not newest and sample_ns < self._since_ns:
-            return None  # of the clock before a jump that an exchange has shown: its instant is unknown
-        self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
-        if newest and self._count < _EVERY_SAMPLE and boot_ns - received_ns > self._state_low_ns:
-            self._state_low_ns, self._state_at_ns = boot_ns - received_ns, received_ns
-        return sample_ns
-
-    def _is_ahead(self, beyond_ns: float, received_ns: int, *, newest: bool) -> None:
-        """Note a state from the future. An overtaken one may bear a stamp from before a jump: it proves nothing."""
-        if newest and beyond_ns > STAMPS_OFF_NS:
-            self.lost, self._since_ns, self._count = True, received_ns, 0
-            self.estimate = UNKNOWN._replace(skew=self.estimate.skew)
-        elif newest:
-            self._ahead_ns, self._doubtful_state = max(beyond_ns, self._ahead_ns), True
+        """The station's time at which a state was sampled; None if it is unknown or impossible."""
+        sample_ns = _sampled_at(self._clocks.known, self._row, boot_ms, received_ns, newest)
+        return None if sample_ns == UNKNOWN else sample_ns
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
         """Take in a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
-        if ts1_ns not in self._pending or received_ns < ts1_ns or abs(tc1_ns) >= LATEST_NS:
-            self.unmatched += 1
-            return None
-        del self._pending[ts1_ns]
-        rtt = self.rtt_ns = received_ns - ts1_ns
-        if ts1_ns < self._since_ns:
-            return rtt  # from before a jump that a newer exchange has shown
-        self._doubtful_state = False
-        middle = ts1_ns + rtt // 2
-        offset = tc1_ns - middle
-        own = _Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - ts1_ns + _READING_NS, ts1_ns)
-        gap_ns = self._known.gap_ns(own) if self._count else 0.0
-        if self.lost or gap_ns > STAMPS_OFF_NS:
-            self._jumped(ts1_ns, keep=0)
-        before = self.estimate
-        doubtful = self._count > 0 and self._is_doubtful(offset, rtt, middle, gap_ns)
-        if self._count == 0:
-            self._known = own
-        elif doubtful:
-            self._doubt(own, gap_ns)
-        else:
-            self._fit(own)
-        slot = self._count % WINDOW
-        self._sent_ns[slot], self._rtt_ns[slot], self._offset_ns[slot] = middle, rtt, offset
-        self._count += 1
-        if self._doubts_in_a_row == SMALL_DOUBTS or (self._doubts == DOUBTS and self._doubted_ns > STAMPS_OFF_NS):
-            self._jumped(ts1_ns, keep=max(self._doubts_in_a_row, DOUBTS))
-        if self._doubts == 0 and (self._count <= _EVERY_SAMPLE or self._count % _ESTIMATE_EVERY == 0):
-            self.estimate = self._estimated(middle)
-        self.estimate = self._within_limits(middle)
-        self._measure_down(tc1_ns, ts1_ns, rtt, before)
-        return rtt
-
-    def _measure_down(self, tc1_ns: int, ts1_ns: int, rtt_ns: int, before: ClockEstimate) -> None:
-        """The one-way delay of an exchange, and the largest error of the loop delays that it is used for.
-
-        If the age of a state and this delay use the same offset, its error cancels. What remains is the error of the
-        reply's stamp, the millisecond in which states are stamped, the change of the estimate between the two, and what
-        keeps either of them from being negative.
-        """
-        known = self.estimate
-        down_ns = known.to_station_ns(tc1_ns) - ts1_ns
-        self.down_ns = min(rtt_ns, max(0, down_ns))
-        self.down_bound_ns = known.bound_at_ns(ts1_ns + self.down_ns)
-        changed_ns = abs(known.offset_ns - before.offset_at_ns(known.reference_ns)) if before.samples else 0
-        since_ns = known.reference_ns - before.reference_ns if before.samples else 0
-        self.loop_bound_ns = (
-            self._stamps_off_ns() + _READING_NS + _BOOT_MS_NS
-            + changed_ns + (DRIFT_BOUND + abs(known.skew)) * (since_ns + rtt_ns)
-            + abs(down_ns - self.down_ns) + self._held_back_ns
-        )  # fmt: skip
-        self._held_back_ns = 0
-
-    def _stamps_off_ns(self) -> float:
-        """The largest error of a stamp."""
-        return max(self.expected_error_ns, self.stamp_error_ns + self._least_ns if self.stamp_error_ns else 0.0)
-
-    @property
-    def _explained_ns(self) -> float:
-        """Contradictions up to this are due to stamps."""
-        return max(self.expected_error_ns, self.stamp_error_ns)
-
-    def _doubt(self, own: _Limits, gap_ns: float) -> None:
-        """Keep the limits of a doubtful exchange beside the known ones."""
-        since = self._doubtful
-        agree = since is not None and since.gap_ns(own) <= self._explained_ns
-        self._doubtful = own if since is None else since.joined(own, tighter=agree)
-        self._doubtful_gap_ns = max(gap_ns, self._doubtful_gap_ns)
-        self._doubts_in_a_row += 1
-        self._ahead_ns = 0.0
-
-    def _fit(self, own: _Limits) -> None:
-        """Narrow the limits by an exchange that fits them, which may show that earlier doubts were errors of stamps."""
-        since, self._doubts_in_a_row = self._doubtful, 0
-        if self._ahead_ns:
-            self.stamp_error_ns, self._ahead_ns = self._explained_ns + self._ahead_ns, 0.0
-        if since is not None:
-            if self._doubts and since.gap_ns(own) <= self._explained_ns:
-                self._doubtful = since.joined(own, tighter=True)
-            else:
-                self.stamp_error_ns = max(self.stamp_error_ns, self._doubtful_gap_ns)
-                self._doubtful, self._doubtful_gap_ns, self._doubts, self._doubted_ns = None, 0.0, 0, 0
-        self._known = self._known.joined(own, tighter=True)
-
-    def _is_doubtful(self, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns: float) -> bool:
-        """Whether an exchange contradicts the limits, or is farther off the line than jitter explains; counts such.
-
-        If one way alone became slower by x, so did the round trip, and the offset is off by x / 2.
-        """
-        contradicts = gap_ns > self._explained_ns
-        if self._count < 2 * LEAST_SAMPLES and not contradicts:
-            return False
-        known = self.estimate
-        off_ns = abs(offset_ns - known.offset_at_ns(at_ns))
-        explained_ns = abs(rtt_ns - self._least_ns) / 2 + _UNUSUAL * self._unusual_ns + self._explained_ns
-        explained_ns += DRIFT_BOUND * abs(at_ns - known.reference_ns) + _DOUBTFUL_NS
-        if contradicts or off_ns > explained_ns:
-            self._doubts += 1
-            self._doubted_ns = off_ns if self._doubts == 1 else self._doubted_ns
-            return True
-        if explained_ns < self._doubted_ns:
-            self._doubts = self._doubted_ns = 0
-        return False
-
-    def _jumped(self, ts1_ns: int, *, keep: int) -> None:
-        """Start over with the newest exchanges.
-
-        A change that stamps may explain is no jump while their error is not known yet: then it is taken for that error.
-        """
-        newest = [k % WINDOW for k in range(self._count - keep, self._count)]
-        for kept in (self._sent_ns, self._rtt_ns, self._offset_ns):
-            kept[:keep] = kept[newest]
-        if keep == SMALL_DOUBTS and self._count - keep < _SETTLED and self._doubtful_gap_ns:
-            self.stamp_error_ns = max(self.stamp_error_ns, self._doubtful_gap_ns)
-        else:
-            self.jumps += 1
-        self._known = self._doubtful or self._known
-        self.lost, self._newest_boot_ns = False, _LONG_AGO_NS
-        self._doubtful, self._doubtful_gap_ns, self._ahead_ns = None, 0.0, 0.0
-        self._count, self._since_ns = keep, ts1_ns
-        self._ways_ns, self._tilt, self._state_low_ns = float(LATEST_NS), _TILT, _LONG_AGO_NS
-        self._doubts = self._doubts_in_a_row = self._doubted_ns = 0
-
-    def _within_limits(self, at_ns: int) -> ClockEstimate:
-        """The estimate at a time: the line, moved between the limits."""
-        known, since = self.estimate, self._doubtful
-        limits = self._known if since is None else self._known.joined(since, tighter=False)
-        low_ns, high_ns = sorted((limits.low_at(at_ns), limits.high_at(at_ns)))  # crossed by errors of stamps
-        offset_ns = min(max(known.offset_at_ns(at_ns), low_ns), high_ns)
-        bound_ns = max(high_ns - offset_ns, offset_ns - low_ns) + round(self._stamps_off_ns())
-        return ClockEstimate(min(self._count, WINDOW), offset_ns, known.skew, bound_ns, at_ns)
-
-    def _estimated(self, now_ns: int) -> ClockEstimate:
-        n, known, ageing = min(self._count, WINDOW), self.estimate, self._tilt
-        rtt, base = self._rtt_ns[:n], int(self._offset_ns[(self._count - 1) % WINDOW])
-        self._least_ns = least = int(rtt.min())
-        t, y = (self._sent_ns[:n] - now_ns).astype(float), (self._offset_ns[:n] - base).astype(float)
-        weight = 1.0 / (rtt - least + _FLOOR_NS) ** 2
-        weight /= _sum(weight)
-        # Sums of products, not `@`: BLAS adds in an order that depends on the processor, and flights must not.
-        t_mean = _sum(weight * t)
-        weighted = weight * (t - t_mean)
-        spread = _sum(weighted * t)
-        # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
-        # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
-        skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
-        if spread > 0.09e18:
-            skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, float(_sum(weighted * y) / spread)))
-            low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
-            tilt = float(_sum(np.abs(weighted) * (rtt - (high_ns - low_ns))) / (2.0 * spread))
-        if tilt >= ageing:
-            skew = known.skew
-            low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
-        state_t = self._state_at_ns - now_ns
-        state_ns = self._state_low_ns - base - skew * state_t
-        low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
-        ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
-        off_ns = max(0.0, self._explained_ns - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
-        if off_ns > 0.0:
-            offset_ns = min(max(float(_sum(weight * y) - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
-            ways_ns = max(ways_ns, float(least))  # this line is only as good as the quickest exchange
-        # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
-        if ways_ns > self._ways_ns + 2.0 * ageing * (now_ns - self._fitted_ns) + _FLOOR_NS:
-            skew, offset_ns = known.skew, float(known.offset_at_ns(now_ns) - base)
-        else:
-            self._ways_ns, self._fitted_ns = ways_ns, now_ns
-            self._tilt = min(ageing, tilt + _WANDER)
-        self._unusual_ns = round(float(np.abs(y - skew * t - offset_ns).max()))
-        return ClockEstimate(samples=n, offset_ns=base + round(offset_ns), skew=skew, bound_ns=0, reference_ns=now_ns)
-
-
-def _quickest(t: _Floats, y: _Floats, rtt: NDArray[np.int64], skew: float, ageing: float) -> tuple[float, float]:
-    """Limits of the offset at t = 0 by the quickest way up and the quickest down; they worsen with age."""
-    offset, way, aged = y - skew * t, (0.5 + 0.5 * skew) * rtt, ageing * t
-    low, high = offset - way, offset + way
-    return float(low[(low + aged).argmax()]), float(high[(high - aged).argmin()])
+        rtt_ns = _reply_at(*self._clocks, self._row, tc1_ns, ts1_ns, received_ns)
+        return None if rtt_ns == UNKNOWN else rtt_ns

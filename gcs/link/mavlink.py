@@ -1,7 +1,8 @@
 """The station's MAVLink 2 codec: frames from and to datagrams.
 
 Message definitions (wire layout, CRC_EXTRA) come from pymavlink's dialect. Framing and checksum are our own, because
-they run for 25,000 datagrams a second with 250 vehicles. Fields are in wire order.
+they run for 25,000 datagrams a second with 250 vehicles. Fields are in wire order. The kernels at the end read and make
+the three messages of which nearly all traffic consists, in the same layout.
 """
 
 import struct
@@ -9,8 +10,11 @@ from collections import Counter
 from math import isfinite
 from typing import Any, NamedTuple
 
+import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from scenarios.kernel import Array, Records, int64, kernel
 
 STATION_SYSTEM_ID = 255
 STATION_COMPONENT_ID = 190
@@ -254,23 +258,135 @@ VELOCITY_IGNORED = 0x0018
 """type_mask values: each bit set makes the vehicle ignore a field."""
 
 
-def acceleration_set_point(*, key_ms: int, target_system: int, north_m_s2: float, east_m_s2: float) -> tuple[Any, ...]:
-    """Fields of SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED with acceleration only, no climb."""
-    return (
-        key_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, north_m_s2, east_m_s2, 0.0, 0.0, 0.0,
-        IGNORE_ALL_BUT_ACCELERATION, target_system, 1, dialect.MAV_FRAME_LOCAL_NED,
-    )  # fmt: skip
+_LOCAL_FRAME = dialect.MAV_FRAME_LOCAL_NED
+SET_POINT = np.dtype(
+    [("sent", "?"), ("type_mask", "u2"), ("velocity_ned_m_s", "f8", (3,)), ("acceleration_ne_m_s2", "f8", (2,))]
+)
+"""What a vehicle is sent as SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED; `sent`: whether it is sent one."""
+POSITION_BYTES, TIMESYNC_BYTES = _LAYOUTS[LOCAL_POSITION_NED].length, _LAYOUTS[TIMESYNC].length
+_SET_POINT_BYTES = _LAYOUTS[SET_POSITION_TARGET_LOCAL_NED].length
+_HEADER_BYTES = _HEADER.size
+_POSITION_EXTRA, _TIMESYNC_EXTRA = CRC_EXTRA[LOCAL_POSITION_NED][0], CRC_EXTRA[TIMESYNC][0]
+_SET_POINT_EXTRA = CRC_EXTRA[SET_POSITION_TARGET_LOCAL_NED][0]
 
 
-def velocity_set_point(
-    *,
-    key_ms: int,
-    target_system: int,
-    velocity_ned_m_s: tuple[float, float, float],
-    acceleration_ne_m_s2: tuple[float, float],
-) -> tuple[Any, ...]:
-    """Fields of SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED with velocity and acceleration."""
-    return (
-        key_ms, 0.0, 0.0, 0.0, *velocity_ned_m_s, *acceleration_ne_m_s2, 0.0, 0.0, 0.0,
-        IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION, target_system, 1, dialect.MAV_FRAME_LOCAL_NED,
-    )  # fmt: skip
+def _crc_step(crc: int, byte: int) -> int:
+    """CRC-16/MCRF4XX after one more byte."""
+    mixed = (byte ^ crc) & 0xFF
+    mixed = (mixed ^ mixed << 4) & 0xFF
+    return crc >> 8 ^ mixed << 8 ^ mixed << 3 ^ mixed >> 4
+
+
+_CRC_TABLE = np.array([_crc_step(0, byte) for byte in range(256)], np.uint16)
+
+
+@kernel
+def checksum(data: Array, begin: int, end: int, extra: int) -> int:
+    """The checksum of a frame whose bytes from its length to its payload are given."""
+    crc = 0xFFFF
+    for place in range(begin, end):
+        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ data[place]) & 0xFF]
+    return crc >> 8 ^ _CRC_TABLE[(crc ^ extra) & 0xFF]
+
+
+@kernel
+def usual_message(data: Array, begin: int, end: int) -> int:
+    """The id of the message in a datagram that holds one valid, unsigned LOCAL_POSITION_NED or TIMESYNC; else -1."""
+    if end - begin < _OVERHEAD or data[begin] != MAGIC or data[begin + 2] or end - begin != _OVERHEAD + data[begin + 1]:
+        return -1
+    msg_id = int64(data[begin + 7])
+    if data[begin + 8] or data[begin + 9] or msg_id not in (LOCAL_POSITION_NED, TIMESYNC):
+        return -1
+    crc = checksum(data, begin + 1, end - 2, _POSITION_EXTRA if msg_id == LOCAL_POSITION_NED else _TIMESYNC_EXTRA)
+    return msg_id if crc == int64(data[end - 2]) | int64(data[end - 1]) << 8 else -1
+
+
+@kernel
+def unsigned_at(data: Array, place: int, size: int, end: int) -> Any:
+    """An unsigned number of so many bytes; those from `end` on count as zeros, which MAVLink 2 omits."""
+    value = np.uint64(0)
+    for k in range(min(size, end - place)):
+        value |= np.uint64(data[place + k]) << np.uint64(8 * k)
+    return value
+
+
+@kernel
+def float_at(data: Array, place: int, end: int) -> float:
+    """A float32 at a place, as `unsigned_at`."""
+    return np.float64(np.uint32(unsigned_at(data, place, 4, end)).view(np.float32))
+
+
+@kernel
+def _put(data: Array, place: int, value: Any, size: int) -> None:
+    for k in range(size):
+        data[place + k] = (value >> np.uint64(8 * k)) & np.uint64(0xFF)
+
+
+@kernel
+def _put_float(data: Array, place: int, value: float) -> None:
+    _put(data, place, np.uint64(np.float32(value).view(np.uint32)), 4)
+
+
+@kernel
+def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, system_id: int, sequence: int) -> None:
+    """Write the frame of a set-point into an array of zeros of its length; its last byte is the frame, never zero."""
+    point = points[row]
+    data[0], data[1], data[4], data[5], data[6] = (
+        MAGIC,
+        _SET_POINT_BYTES,
+        sequence,
+        STATION_SYSTEM_ID,
+        STATION_COMPONENT_ID,
+    )
+    data[7] = SET_POSITION_TARGET_LOCAL_NED
+    _put(data, _HEADER_BYTES, np.uint64(key_ms), 4)
+    for k in range(3):
+        _put_float(data, _HEADER_BYTES + 4 * (4 + k), point.velocity_ned_m_s[k])
+    for k in range(2):
+        _put_float(data, _HEADER_BYTES + 4 * (7 + k), point.acceleration_ne_m_s2[k])
+    end = _HEADER_BYTES + _SET_POINT_BYTES
+    _put(data, end - 5, np.uint64(point.type_mask), 2)
+    data[end - 3], data[end - 2], data[end - 1] = system_id, 1, _LOCAL_FRAME
+    _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
+
+
+def set_point_frames(points: Records, rows: Array, sequences: Array, system_ids: Array, key_ms: int) -> list[bytes]:
+    """The frames of the set-points of some vehicles, each numbered in a sequence of its own.
+
+    `points` (SET_POINT), `sequences` and `system_ids` hold those of all vehicles; `sequences` is advanced.
+    """
+    frames = np.zeros((len(rows), _OVERHEAD + _SET_POINT_BYTES), np.uint8)
+    _encode_set_points(frames, points, rows, sequences, system_ids, key_ms)
+    return rows_of(frames)
+
+
+def rows_of(frames: Array) -> list[bytes]:
+    """The rows of an array of bytes."""
+    data, size = frames.tobytes(), frames.shape[1]
+    return [data[begin : begin + size] for begin in range(0, len(data), size)]
+
+
+@kernel
+def _encode_set_points(
+    frames: Array, points: Records, rows: Array, sequences: Array, system_ids: Array, key_ms: int
+) -> None:
+    for place in range(len(rows)):
+        row = rows[place]
+        sequences[row] = (sequences[row] + 1) & 0xFF
+        _encode_set_point(frames[place], points, row, key_ms, system_ids[row], sequences[row])
+
+
+REQUEST_FRAME_BYTES = _OVERHEAD + TIMESYNC_BYTES
+
+
+@kernel
+def encode_request(data: Array, ts1_ns: int, sequence: int) -> int:
+    """Write the frame of a TIMESYNC request into `REQUEST_FRAME_BYTES` zeros; returns its length."""
+    _put(data, _HEADER_BYTES + 8, np.uint64(ts1_ns), 8)
+    end = len(data) - 2
+    while end > _HEADER_BYTES + 1 and not data[end - 1]:
+        end -= 1  # trailing zeros are omitted, except for the first byte of the payload
+    data[0], data[1], data[4] = MAGIC, end - _HEADER_BYTES, sequence
+    data[5], data[6], data[7] = STATION_SYSTEM_ID, STATION_COMPONENT_ID, TIMESYNC
+    _put(data, end, np.uint64(checksum(data, 1, end, _TIMESYNC_EXTRA)), 2)
+    return end + 2

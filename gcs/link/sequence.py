@@ -1,10 +1,12 @@
 """Loss, lateness and duplication from MAVLink's 8-bit sequence numbers."""
 
+import numpy as np
+
+from scenarios.kernel import Cell, Columns, Record, Records, kernel
 from scenarios.schema import NS_PER_S
 
 _KEPT = 128
 """How far back the sequence counter remembers which frames arrived."""
-_SEEN = (1 << _KEPT) - 1
 NEW, LATE, DUPLICATE = 0, 1, 2
 _NO_DOUBT = 100.0 * NS_PER_S
 """While fewer than 100 frames are expected, the next number is the next frame."""
@@ -20,9 +22,137 @@ frames have lately been overtaken, the smaller this allowance is, down to the se
 _MOST = 0xFFFFFFFF
 """The largest count that the tick record holds: a log whose clock jumps by centuries seems to have lost more."""
 _FORGET = 1.0 / 512
+_LONGEST = 9e18
+"""Expected frames times ns beyond which it makes no difference how many: more than `_MOST` are lost."""
 _RUN, _RUN_STEP = 8, 4
 """This many late frames in a row, each newer than the last by at most the second figure, are new after all: an
 earlier, very late frame was taken for a new one."""
+
+
+COUNTER = np.dtype(
+    [
+        ("received", "i8"), ("lost", "i8"), ("late", "i8"), ("duplicate", "i8"),
+        ("last", "i8"),  # sequence number of the last frame
+        ("newest", "i8"), ("newest_ns", "i8"),  # number of the newest frame, wraps undone; -1 before the first
+        ("seen", "u8"), ("seen_before", "u8"),  # bit k: frame number newest - k has arrived, and newest - 64 - k
+        ("run", "i8"),  # late frames in a row, each a little newer than the last
+        ("lag", "f8"),  # how far frames have lately been overtaken
+        ("rate_hz", "f8"), ("rate_count", "i8"), ("rate_ns", "i8"), ("steady_frames", "f8"), ("steady_ns", "f8"),
+    ],
+    align=True,
+)  # fmt: skip
+"""The count of one sender's frames."""
+
+
+@kernel
+def count(counter: Record, sequence: int, time_ns: int) -> int:
+    """Count a frame received at a time: NEW if it is newer than all before it, else LATE or DUPLICATE."""
+    counter.received += 1
+    step = (sequence - counter.last) & 0xFF
+    counter.last = sequence
+    if counter.newest < 0:
+        counter.newest, counter.newest_ns = sequence, time_ns
+        counter.rate_count, counter.rate_ns = sequence, time_ns
+        counter.seen = 1
+        return NEW
+    since_ns = max(0, time_ns - counter.newest_ns)  # in a log the clock may have been set back
+    expected = counter.rate_hz * since_ns
+    if step == 1 and (sequence - counter.newest) & 0xFF == 1 and counter.run == 0 and expected < _NO_DOUBT:
+        # A short cut: most frames are simply the next one. The general case below gives the same.
+        counter.lag *= 1.0 - _FORGET
+        _see_next(counter, 1)
+        if since_ns >= _STEADY_NS or time_ns - counter.rate_ns >= _RATE_NS:
+            _note_rate(counter, time_ns)
+        counter.newest_ns = time_ns
+        return NEW
+    passed = int(min(expected, _LONGEST)) // NS_PER_S
+    most = passed + max(_LEAST_AHEAD, _AHEAD - int(counter.lag))
+    ahead = most - ((most - sequence + counter.newest) & 0xFF)
+    if ahead <= 0 and 0 < step <= _RUN_STEP:
+        counter.run += 1
+        if counter.run == _RUN:
+            counter.lost -= ahead + 255  # nobody knows whether any of these are lost
+            ahead += 256
+    else:
+        counter.run = 0
+    counter.lag = max(counter.lag * (1.0 - _FORGET), float(-ahead))
+    if ahead > 0:
+        counter.lost = min(counter.lost + ahead - 1, _MOST)
+        _see_next(counter, ahead)
+        _note_rate(counter, time_ns)
+        counter.newest_ns = time_ns
+        return NEW
+    back = -ahead
+    seen, place = counter.seen, back
+    if back >= 64:
+        seen, place = counter.seen_before, back - 64
+    bit = np.uint64(1) << np.uint64(place) if back < _KEPT else np.uint64(0)
+    if seen & bit:
+        counter.duplicate += 1
+        return DUPLICATE
+    counter.late += 1
+    counter.lost = max(0, counter.lost - 1)
+    if back >= 64:
+        counter.seen_before |= bit
+    else:
+        counter.seen |= bit
+    return LATE
+
+
+@kernel
+def restart(counter: Record) -> None:
+    """Take the next frame as the first: the sender has restarted."""
+    counter.newest = -1
+    counter.newest_ns = counter.rate_ns = counter.rate_count = counter.run = counter.last = 0
+    counter.seen = counter.seen_before = 0
+    counter.rate_hz = counter.lag = counter.steady_frames = counter.steady_ns = 0.0
+
+
+@kernel
+def _see_next(counter: Record, ahead: int) -> None:
+    """Note the arrival of the frame that is so many numbers newer than the newest."""
+    counter.newest += ahead
+    if ahead >= _KEPT:
+        counter.seen = counter.seen_before = 0
+    elif ahead >= 64:
+        counter.seen_before = counter.seen << np.uint64(ahead - 64)
+        counter.seen = 0
+    else:
+        carried = counter.seen >> np.uint64(64 - ahead)
+        counter.seen_before = counter.seen_before << np.uint64(ahead) | carried
+        counter.seen = counter.seen << np.uint64(ahead)
+    counter.seen |= np.uint64(1)
+
+
+@kernel
+def _note_rate(counter: Record, time_ns: int) -> None:
+    """Update the rate of frames sent, from times without a pause."""
+    steady = time_ns - counter.newest_ns < _STEADY_NS
+    since_ns = time_ns - counter.rate_ns
+    if steady and since_ns < _RATE_NS:
+        return
+    if steady:
+        counter.steady_frames = _OLDER * counter.steady_frames + (counter.newest - counter.rate_count)
+        counter.steady_ns = _OLDER * counter.steady_ns + since_ns
+        counter.rate_hz = counter.steady_frames / counter.steady_ns * NS_PER_S
+    counter.rate_count, counter.rate_ns = counter.newest, time_ns
+
+
+@kernel
+def _count_at(counters: Records, row: int, sequence: int, time_ns: int) -> int:
+    return count(counters[row], sequence, time_ns)
+
+
+@kernel
+def _restart_at(counters: Records, row: int) -> None:
+    restart(counters[row])
+
+
+def new_counters(n: int) -> Records:
+    """Counters of `COUNTER` for n senders that have sent nothing."""
+    counters = np.zeros(n, COUNTER)
+    counters["newest"] = -1
+    return counters
 
 
 class SequenceCounter:
@@ -34,79 +164,20 @@ class SequenceCounter:
     miscounted. A late frame no longer counts as lost.
     """
 
-    __slots__ = (
-        "_lag", "_last", "_newest", "_newest_ns", "_rate_count", "_rate_hz", "_rate_ns", "_run", "_seen",
-        "_steady_frames", "_steady_ns", "duplicate", "late", "lost", "received",
-    )  # fmt: skip
+    received = Cell[int]()
+    lost = Cell[int]()
+    late = Cell[int]()
+    duplicate = Cell[int]()
 
-    def __init__(self) -> None:
-        self.received = self.lost = self.late = self.duplicate = 0
-        self.restart()
+    def __init__(self, counters: Records = None, row: int = 0) -> None:
+        """The counter in a row of an array of `COUNTER`."""
+        self._counters, self._row = new_counters(1) if counters is None else counters, row
+        self._columns = Columns(self._counters)
 
     def add(self, sequence: int, time_ns: int) -> int:
         """Count a frame received at a time: NEW if it is newer than all before it, else LATE or DUPLICATE."""
-        self.received += 1
-        step = (sequence - self._last) & 0xFF
-        self._last = sequence
-        if self._newest < 0:
-            self._newest, self._newest_ns = sequence, time_ns
-            self._rate_count, self._rate_ns = sequence, time_ns
-            self._seen = 1
-            return NEW
-        since_ns = max(0, time_ns - self._newest_ns)  # in a log the clock may have been set back
-        expected = self._rate_hz * since_ns
-        if step == 1 and (sequence - self._newest) & 0xFF == 1 and self._run == 0 and expected < _NO_DOUBT:
-            # A short cut: most frames are simply the next one. The general case below gives the same.
-            self._lag *= 1.0 - _FORGET
-            self._seen = (self._seen << 1 | 1) & _SEEN
-            self._newest += 1
-            if since_ns >= _STEADY_NS or time_ns - self._rate_ns >= _RATE_NS:
-                self._note_rate(time_ns)
-            self._newest_ns = time_ns
-            return NEW
-        passed = int(expected) // NS_PER_S
-        most = passed + max(_LEAST_AHEAD, _AHEAD - int(self._lag))
-        ahead = most - ((most - sequence + self._newest) & 0xFF)
-        if ahead <= 0 and 0 < step <= _RUN_STEP:
-            self._run += 1
-            if self._run == _RUN:
-                self.lost -= ahead + 255  # nobody knows whether any of these are lost
-                ahead += 256
-        else:
-            self._run = 0
-        self._lag = max(self._lag * (1.0 - _FORGET), -ahead)
-        if ahead > 0:
-            self.lost = min(self.lost + ahead - 1, _MOST)
-            self._seen = (self._seen << min(ahead, _KEPT) | 1) & _SEEN
-            self._newest += ahead
-            self._note_rate(time_ns)
-            self._newest_ns = time_ns
-            return NEW
-        bit = 1 << min(-ahead, _KEPT)
-        if self._seen & bit:
-            self.duplicate += 1
-            return DUPLICATE
-        self.late += 1
-        self.lost = max(0, self.lost - 1)
-        if -ahead < _KEPT:
-            self._seen |= bit
-        return LATE
+        return _count_at(self._counters, self._row, sequence, time_ns)
 
     def restart(self) -> None:
         """Take the next frame as the first: the sender has restarted."""
-        self._newest = -1
-        self._newest_ns = self._rate_ns = self._rate_count = self._run = self._last = 0
-        self._seen = 0  # bit k: frame number `newest - k` has arrived
-        self._rate_hz = self._lag = self._steady_frames = self._steady_ns = 0.0
-
-    def _note_rate(self, time_ns: int) -> None:
-        """Update the rate of frames sent, from times without a pause."""
-        steady = time_ns - self._newest_ns < _STEADY_NS
-        since_ns = time_ns - self._rate_ns
-        if steady and since_ns < _RATE_NS:
-            return
-        if steady:
-            self._steady_frames = _OLDER * self._steady_frames + (self._newest - self._rate_count)
-            self._steady_ns = _OLDER * self._steady_ns + since_ns
-            self._rate_hz = self._steady_frames / self._steady_ns * NS_PER_S
-        self._rate_count, self._rate_ns = self._newest, time_ns
+        _restart_at(self._counters, self._row)

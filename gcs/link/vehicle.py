@@ -2,11 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from gcs.link import mavlink
-from gcs.link.clocks import LEAST_SAMPLES, VehicleClock
-from gcs.link.datagram import Address
+from gcs.link.clocks import (
+    LEAST_SAMPLES,
+    UNKNOWN,
+    Clocks,
+    VehicleClock,
+    boot_ns_of,
+    estimate_of,
+    new_clocks,
+    request,
+    to_station_ns,
+)
+from gcs.link.datagram import Address, Outgoing
 from gcs.link.kinds import (
     ARM_DISARM,
     SET_MESSAGE_INTERVAL,
@@ -19,14 +31,18 @@ from gcs.link.kinds import (
     commanded_mode,
     mode_command,
 )
-from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter
+from gcs.link.mavlink import encode_request
+from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
 from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
+from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
 from scenarios.schema import NS_PER_S
 
 ARMED = 0x80
 STATE_CRITICAL = 5
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
+_NOBODY = -1
+"""In place of the number of an address."""
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
 _FORGET_NUMBERS_NS = 3 * NS_PER_S
@@ -35,6 +51,82 @@ SILENCE_S = 1.5
 that sends nothing at all for this long may be accepted from another address."""
 _SILENT_NS = 3 * NS_PER_S
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
+
+
+LINK = np.dtype(
+    [
+        ("address", "i8"),  # place among `Links.addresses`, or _NOBODY
+        ("heard_ns", "i8"),  # newest valid frame
+        ("first_heard_ns", "i8"),  # first one, or 0
+        ("newest", "?"),  # the last frame taken in was sent after all the others
+        ("told", "i8"),  # bits of what was reported of the order of its frames: 1 << LATE, 1 << DUPLICATE
+        ("left_out", "?"),  # see `RemoteVehicle`
+        ("sequence", "i8"),  # of the last frame sent to it
+        ("lag_ms", "i8"),  # the reported lag of held set-points, and how often the clock had jumped by then; -1: never
+        ("lag_jumps", "i8"),
+        ("local_ms", "i8"),
+        ("local", "f8", (6,)),  # its newest LOCAL_POSITION_NED, and whether it has sent one since
+        ("local_is_new", "?"),  # the start-up was last told of it
+    ],
+    align=True,
+)
+"""What every frame from or to one vehicle changes."""
+
+
+class Links(NamedTuple):
+    """The links to n vehicles."""
+
+    known: Records
+    """Of LINK, (n,)."""
+    clocks: Clocks
+    counters: Records
+    addresses: dict[Address, int]
+    """A number for each address that vehicles have sent from."""
+
+
+def new_links(n: int) -> Links:
+    """Links over which nothing has been heard."""
+    known = np.zeros(n, LINK)
+    known["address"], known["newest"], known["lag_jumps"] = _NOBODY, True, -1
+    return Links(known, new_clocks(n), new_counters(n), {})
+
+
+def requests_to(links: Links, rows: Sequence[int], now_ns: int) -> list[bytes]:
+    """The frames of TIMESYNC requests that are sent to some vehicles now."""
+    frames = np.zeros((len(rows), mavlink.REQUEST_FRAME_BYTES), np.uint8)
+    sizes = _ask(frames, links.known, links.clocks.known, links.clocks.pending_ns, np.array(rows, np.int64), now_ns)
+    return [frame[:size] for frame, size in zip(mavlink.rows_of(frames), sizes.tolist(), strict=True)]
+
+
+@kernel
+def _ask(frames: Array, known: Records, clocks: Records, pending_ns: Array, rows: Array, now_ns: int) -> Array:
+    """Note the requests and write their frames; returns the sizes of these."""
+    sizes = np.empty(len(rows), np.int64)
+    for place in range(len(rows)):
+        row = rows[place]
+        known[row].sequence = (known[row].sequence + 1) & 0xFF
+        ts1_ns = request(clocks[row], pending_ns[row], now_ns)
+        sizes[place] = encode_request(frames[place], ts1_ns, known[row].sequence)
+    return sizes
+
+
+@kernel
+def delivery_ns(link: Record, clock: Record, key_ms: int, sent_ns: int) -> int:
+    """How long after `sent_ns` the set-point with this stamp acts: it arrives, and the vehicle may hold it.
+
+    It acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is unknown.
+    UNKNOWN while the delay to the vehicle is.
+    """
+    if clock.down_ns == UNKNOWN or not key_ms or link.lag_jumps != clock.jumps or not clock.samples:
+        return clock.down_ns
+    known = estimate_of(clock)
+    boot_ns = boot_ns_of(known, (key_ms + link.lag_ms) & 0xFFFFFFFF, sent_ns)
+    return max(clock.down_ns, to_station_ns(known, boot_ns) - sent_ns)
+
+
+@kernel
+def _delivery_at_ns(known: Records, clocks: Records, row: int, key_ms: int, sent_ns: int) -> int:
+    return delivery_ns(known[row], clocks[row], key_ms, sent_ns)
 
 
 Report = Callable[[str, str, int], None]
@@ -59,7 +151,18 @@ class RemoteVehicle:
     """What is known of one vehicle; `next_frame` gives the frames that bring it to the state the station wants.
 
     `startup` holds what depends on the kind of vehicle. At the end the vehicle lands if `land` is set, else it holds.
+    What every frame changes is in a row of `links`.
     """
+
+    heard_ns = Cell[int]()
+    """When the newest valid frame came."""
+    first_heard_ns = Cell[int | None](0)
+    newest = Cell[bool]()
+    """Whether the last frame taken in was sent after all the others."""
+    left_out = Cell[bool]()
+    """Whether the formation flies without it because it did not become ready in time."""
+    _local_ms, _local_is_new = Cell[int](), Cell[bool]()
+    _told, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
 
     def __init__(
         self,
@@ -69,19 +172,18 @@ class RemoteVehicle:
         report: Report = ignored,
         land: bool = False,
         external: bool = False,
+        links: Links | None = None,
+        row: int = 0,
     ) -> None:
         self.system_id = system_id
         self.external = external
         """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter."""
-        self.address: Address | None = None
-        self.heard_ns = 0  # newest valid frame
+        self._links, self._row = links or new_links(1), row
+        self._columns = Columns(self._links.known)
+        self._address: Address | None = None
         self.heartbeat_ns = 0  # newest heartbeat
-        self.frames = SequenceCounter()
-        self.newest = True
-        """Whether the last frame taken in was sent after all the others."""
-        self.clock = VehicleClock()
-        self._lag = 0, -1
-        """The reported lag in ms, and how often the clock had jumped by then; -1 before the first report."""
+        self.frames = SequenceCounter(self._links.counters, row)
+        self.clock = VehicleClock(self._links.clocks, row)
         self.armed = False
         self.custom_mode = -1
         self.critical = False
@@ -90,18 +192,14 @@ class RemoteVehicle:
         self.taken_over = False
         """Whether the vehicle's pilot flies it, or its autopilot for a reason of its own. This ends only when it
         reports that it is guided; until then the station asks it for telemetry and commands nothing."""
-        self.left_out = False
-        """Whether the formation flies without it because it did not become ready in time."""
         self.startup = ExternalStartup(startup) if external else startup
         self.kind = startup.kind
-        self.first_heard_ns: int | None = None
         self._has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
         """When the first heartbeat after a long silence arrived. It may be a replay: its number does not show that."""
         self._land = land
         self._now_ns = 0
         self._report = report
-        self._sequence = 0
         self._command: _Waiting | None = None
         self._settled = False
         """Whether the vehicle takes set-points and lacks nothing, so that no command is due until it says otherwise.
@@ -109,10 +207,19 @@ class RemoteVehicle:
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still come."""
         self._not_before_ns = 0
-        self._reported_orders = {NEW}
         self._outdated: list[tuple[int, int, bool]] = []
         """Time of the ACK of each recent command that changed mode or arming, with the mode and arming before it. A
         heartbeat made before the command was carried out may still report these."""
+
+    @property
+    def address(self) -> Address | None:
+        return self._address
+
+    @address.setter
+    def address(self, address: Address | None) -> None:
+        numbers, self._address = self._links.addresses, address
+        number = _NOBODY if address is None else numbers.setdefault(address, len(numbers))
+        self._links.known["address"][self._row] = number
 
     @property
     def end_mode(self) -> int:
@@ -131,6 +238,11 @@ class RemoteVehicle:
     def guided(self) -> bool:
         """Whether it takes part in the flight: armed and in its guided mode, or flown by somebody else as planned."""
         return self.external or (self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over)
+
+    @property
+    def idle(self) -> bool:
+        """Whether `next_frame` has nothing to send until the vehicle says something."""
+        return self._settled and self.goal is Goal.FLY
 
     @property
     def ready(self) -> bool:
@@ -156,6 +268,11 @@ class RemoteVehicle:
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
 
+    def send(self, msg_id: int, fields: tuple[Any, ...], outgoing: list[Outgoing]) -> None:
+        """Add a frame to the datagrams to be sent, if the vehicle's address is known."""
+        if self.address is not None:
+            outgoing.append((self.encode(msg_id, fields), self.address))
+
     def is_elsewhere(self, address: Address, received_ns: int) -> bool:
         """Whether the vehicle is known to send from another address and has been heard lately."""
         return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * NS_PER_S
@@ -172,9 +289,9 @@ class RemoteVehicle:
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
         order = self.frames.add(frame.sequence, now_ns)
-        if order not in self._reported_orders:
-            self._reported_orders.add(order)
-            self._report("link", _ORDER_TEXT[order], self.system_id)
+        if order != NEW and not self._told >> order & 1:
+            self._told |= 1 << order
+            self.report_order(order)
         self.newest = order == NEW
         if heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
             self._doubtful_ns = now_ns
@@ -186,23 +303,31 @@ class RemoteVehicle:
             self.heartbeat_ns = now_ns
         return replayed
 
+    def tell_startup(self, msg_id: int, fields: tuple[Any, ...]) -> None:
+        """Let the start-up take in a message; kernels tell it nothing of positions."""
+        self._tell_position()
+        self.startup.take(msg_id, fields)
+
+    def _tell_position(self) -> None:
+        if self._local_is_new:
+            self._local_is_new = False
+            local: list[float] = self._links.known["local"][self._row].tolist()
+            self.startup.take(mavlink.LOCAL_POSITION_NED, (self._local_ms, *local))
+
+    def report_order(self, order: int) -> None:
+        """Report that its frames arrive LATE or are DUPLICATE."""
+        self._report("link", _ORDER_TEXT[order], self.system_id)
+
     def named_int(self, fields: tuple[Any, ...]) -> None:
         """Take in a NAMED_VALUE_INT: the lag after which the vehicle's held set-points act."""
         _, value, name = fields
         if name.rstrip(b"\0") == b"LAG_MS":
-            self._lag = value, self.clock.jumps
+            self._lag_ms, self._lag_jumps = value, self.clock.jumps
 
     def delivery_ns(self, key_ms: int, sent_ns: int) -> int | None:
-        """How long after `sent_ns` the set-point with this stamp acts: it arrives, and the vehicle may hold it.
-
-        It acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is unknown.
-        None while the delay to the vehicle is unknown.
-        """
-        clock, (lag_ms, jumps) = self.clock, self._lag
-        if clock.down_ns is None or not key_ms or jumps != clock.jumps or not clock.estimate.samples:
-            return clock.down_ns
-        boot_ns = clock.boot_ns(key_ms + lag_ms & 0xFFFFFFFF, sent_ns)
-        return max(clock.down_ns, clock.estimate.to_station_ns(boot_ns) - sent_ns)
+        """How long after `sent_ns` the set-point with this stamp acts; None while that is unknown."""
+        found_ns = _delivery_at_ns(self._links.known, self._links.clocks.known, self._row, key_ms, sent_ns)
+        return None if found_ns == UNKNOWN else found_ns
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a HEARTBEAT. One made before the vehicle carried out a command does not undo what its ACK said."""
@@ -300,7 +425,7 @@ class RemoteVehicle:
         one that comes sooner than a round trip after the next request with the same command does not count for that.
         """
         self._now_ns = now_ns
-        if self.address is None or (self._settled and self.goal is Goal.FLY):
+        if self.address is None or self.idle:
             return None
         frame = self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
@@ -348,10 +473,11 @@ class RemoteVehicle:
         return command if command is None or not self.taken_over or command[0] == SET_MESSAGE_INTERVAL else None
 
     def _next_step(self) -> Step:
+        self._tell_position()
         return self.startup.next(
             custom_mode=self.custom_mode,
             armed=self.armed,
-            clock_known=self.clock.estimate.samples >= LEAST_SAMPLES,
+            clock_known=self.clock.samples >= LEAST_SAMPLES,
             now_ns=self._now_ns,
         )
 

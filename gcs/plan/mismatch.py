@@ -29,6 +29,19 @@ _MOST_ON_THE_WAY = 2000
 """Most commands on their way for which the sampled window is computed."""
 
 
+def used_s(shorter_s: float, longer_s: float, mismatch_s: float) -> float:
+    """How much of `longer_s` a mismatch (loop delay minus assumed) uses; one of -`shorter_s` uses all of it.
+
+    Infinite if the loop delay is shorter than assumed and no shorter one is tolerated.
+
+    >>> used_s(0.1, 0.2, 0.05), used_s(0.1, 0.2, -0.05)
+    (0.05, 0.1)
+    """
+    if mismatch_s >= 0.0 or shorter_s == inf:
+        return mismatch_s
+    return -mismatch_s * longer_s / shorter_s if shorter_s > 0.0 else inf
+
+
 class Tolerated(NamedTuple):
     """How much shorter and longer (s) than assumed the loop delay may be, for each set of the gain schedule.
 
@@ -39,18 +52,8 @@ class Tolerated(NamedTuple):
     longer_s: tuple[float, ...]
 
     def used_s(self, gain_set: int, mismatch_s: float) -> float:
-        """How much of `longer_s` a mismatch (loop delay minus assumed) uses; one of -`shorter_s` uses all of it.
-
-        Infinite if the loop delay is shorter than assumed and no shorter one is tolerated.
-
-        >>> half = Tolerated((0.1,), (0.2,))
-        >>> half.used_s(0, 0.05), half.used_s(0, -0.05)
-        (0.05, 0.1)
-        """
-        shorter_s = self.shorter_s[gain_set]
-        if mismatch_s >= 0.0 or shorter_s == inf:
-            return mismatch_s
-        return -mismatch_s * self.longer_s[gain_set] / shorter_s if shorter_s > 0.0 else inf
+        """See `used_s`."""
+        return used_s(self.shorter_s[gain_set], self.longer_s[gain_set], mismatch_s)
 
 
 class Tabulated:

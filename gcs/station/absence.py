@@ -21,6 +21,10 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
     return TAKEN_OVER if vehicle.taken_over else ""
 
 
+PILOTED = (TAKEN_OVER, STAYS_DISARMED)
+"""Reasons that are a pilot's, or were."""
+
+
 def describe_change(was: str, now: str) -> str:
     """The text of the event when a vehicle's absence changes."""
     return now or ("is heard again" if was == LOST else "is given back")

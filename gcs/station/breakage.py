@@ -8,23 +8,19 @@ is granted this time again only if it has been within the limit since, or if its
 diverges while its vehicles keep entering their failsafe is broken.
 """
 
-from collections.abc import Sequence
-from math import hypot, inf, isfinite, isnan, log, nan, sqrt
+from collections.abc import Mapping
+from math import hypot, inf, isfinite, isnan, log, sqrt
 
 import numpy as np
 
-from gains.core.arrays import FloatArray
-from gcs.autopilot.kinds import STAYS_DISARMED
 from gcs.control.history import Reports
-from gcs.control.law import VehicleControl
-from gcs.control.tick import Mode
+from gcs.control.law import Nearest
+from gcs.control.limits import any_beyond
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import TAKEN_OVER
-from gcs.station.monitor import VehicleState
+from scenarios.kernel import Record, Records
 
 _TIME_CONSTANTS = 3.0
 """After this many time constants an error has decayed to a twentieth."""
-_AWAY = (Mode.LOST, Mode.FAILSAFE)
 
 
 def not_formed(plan: FlightPlan, history: Reports) -> str:
@@ -54,42 +50,41 @@ class Breakage:
         self._judged_from_s = [-inf] * n
         self._has_returned = [True] * n
         """Whether the vehicle has been within the limit since it was last granted time to return."""
+        self._all_back = True
+        """Whether this is so of every vehicle, and none is away."""
         self._piloted = [False] * n
         self._behind: list[list[int]] = [[row] for row in range(n)]
         """Each vehicle with all that follow it, directly or through others."""
         for row in range(n - 1, 0, -1):
             self._behind[plan.model.predecessors[row]] += self._behind[row]
 
-    def judge(
-        self,
-        controls: Sequence[VehicleControl],
-        states: Sequence[VehicleState],
-        absent: Sequence[str],
-        distance_m: FloatArray,
-        nearest_m: Sequence[float],
-        time_s: float,
-    ) -> str:
-        """Why the flight must end at this tick; empty if it may continue."""
-        ids = self._plan.formation.system_ids
-        closest_m = min((distance for distance in nearest_m if not isnan(distance)), default=nan)
+    def judge(self, controls: Records, away: Mapping[int, bool], nearest: Nearest, time_s: float) -> str:
+        """Why the flight must end at this tick; empty if it may continue.
+
+        `away` holds the vehicles, by row, that do not follow their commands, and whether pilots fly them.
+        """
+        ids, limit_m = self._plan.formation.system_ids, self._safety.spacing_error_limit_m
+        closest_m = np.fmin.reduce(nearest.distance_m)
         if closest_m < self._safety.collision_distance_m:
-            one, two = (ids[row] for row in divmod(int(np.nanargmin(distance_m)), len(controls)))
+            one, two = (ids[row] for row in nearest.two)
             return f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart"
-        for row, (state, why) in enumerate(zip(states, absent, strict=True)):
-            if why or state.released or state.mode in _AWAY:
+        if not away and self._all_back and not any_beyond(controls["spacing_error_m"], 0.7 * limit_m):
+            return ""
+        for row in range(len(controls)):
+            if row in away:
                 self._away[row] = True
-                self._piloted[row] |= why in (TAKEN_OVER, STAYS_DISARMED)
+                self._piloted[row] |= away[row]
             elif self._away[row]:
                 self._come_back(row, controls, time_s)
-        limit_m = self._safety.spacing_error_limit_m
-        for row, control in enumerate(controls):
-            error_m = hypot(*control.spacing_error_m)
+        for row, error in enumerate(controls["spacing_error_m"].tolist()):
+            error_m = hypot(*error)
             self._has_returned[row] |= not self._away[row] and not error_m > limit_m  # the leader has no spacing error
             if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
                 return f"broken: spacing error of vehicle {ids[row]} is {error_m:.0f} m, limit {limit_m:g} m"
+        self._all_back = all(self._has_returned) and not any(self._away)
         return ""
 
-    def _come_back(self, row: int, controls: Sequence[VehicleControl], time_s: float) -> None:
+    def _come_back(self, row: int, controls: Records, time_s: float) -> None:
         """Give a vehicle and all behind it time to return, once their distances are known."""
         distances_m = [self._way_m(controls[other]) for other in self._behind[row]]
         if not isfinite(distances_m[0]):
@@ -104,10 +99,10 @@ class Breakage:
         for other in self._behind[row]:
             self._judged_from_s[other] = max(self._judged_from_s[other], until_s)
 
-    def _way_m(self, control: VehicleControl) -> float:
+    def _way_m(self, control: Record) -> float:
         """The spacing error plus the distance covered while the velocity error decays; NaN while unknown."""
-        spacing_m = hypot(*control.spacing_error_m)
-        carried_m = hypot(*control.velocity_error_m_s) / self._decay_1_s if self._decay_1_s > 0 else 0.0
+        spacing_m = hypot(*control["spacing_error_m"].tolist())
+        carried_m = hypot(*control["velocity_error_m_s"].tolist()) / self._decay_1_s if self._decay_1_s > 0 else 0.0
         return carried_m + (0.0 if isnan(spacing_m) else spacing_m)  # the leader has no spacing error
 
 

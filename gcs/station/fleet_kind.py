@@ -4,19 +4,21 @@
 the loop is closed is another choice, see `gcs.control.loops`.
 """
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
+import numpy as np
+
+from gains.core.arrays import FloatArray
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.law import Blend, VehicleControl
-from gcs.control.loops import Loop, Order
+from gcs.control.loops import Loop, Orders
 from gcs.control.manoeuvring import loop_of
 from gcs.control.own_law import FlownLaw, LawHooks
 from gcs.control.phases import Phase, patience_s
 from gcs.link.startup import LaunchedStartup
-from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
+from gcs.link.vehicle import Links, RemoteVehicle, Report, in_words, new_links, refusals
 from gcs.plan.flight_plan import FlightPlan
+from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
 
 
@@ -26,9 +28,10 @@ class FleetKind(Protocol):
     plan: FlightPlan
     """The flight plan; once the vehicles are identified, with margins for their responses."""
     vehicles: list[RemoteVehicle]
+    links: Links
     loop: Loop
-    frame_ned_m: list[tuple[float, float, float]]
-    """Origin of each vehicle's local frame, in the frame of the first vehicle."""
+    frame_ned_m: FloatArray
+    """Origin (n, 3) of each vehicle's local frame, in the frame of the first vehicle."""
     speaks_mavlink_1_first: bool
     """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
     holds_when_left_alone: bool
@@ -54,8 +57,8 @@ class FleetKind(Protocol):
         """The flight ends: report what was counted."""
         ...
 
-    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
-        """The commands of the control law, limited to what the vehicles are known to follow."""
+    def bound(self, controls: Records, blends: Records) -> None:
+        """Limit the commands of the control law to what the vehicles are known to follow."""
         ...
 
     def locate(self, history: StateHistory) -> None:
@@ -66,8 +69,8 @@ class FleetKind(Protocol):
         """Advance the identification by one tick; returns why it failed, if it has."""
         ...
 
-    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
-        """Fields of the set-point that a vehicle is sent at this tick, if any."""
+    def set_points(self, orders: Orders, phase: Phase) -> Records:
+        """The set-points of this tick (n, SET_POINT), and which vehicles are sent one."""
         ...
 
 
@@ -93,6 +96,7 @@ class LaunchedFleet:
         self.plan = plan
         self._law = law
         self.loop = loop_of(plan, law)
+        self.links = new_links(len(plan.formation.system_ids))
         self.vehicles = [
             RemoteVehicle(
                 system_id,
@@ -102,10 +106,12 @@ class LaunchedFleet:
                 report=report,
                 land=scenario.at_end == "land",
                 external=system_id == scenario.external_id,
+                links=self.links,
+                row=row,
             )
-            for system_id in plan.formation.system_ids
+            for row, system_id in enumerate(plan.formation.system_ids)
         ]
-        self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(self.vehicles)
+        self.frame_ned_m = np.zeros((len(self.vehicles), 3))
         self._patience_ns = patience_s(scenario) * NS_PER_S
 
     def startup_failure(self, due_ns: int, start_ns: int, history: StateHistory) -> str:  # noqa: ARG002
@@ -119,9 +125,8 @@ class LaunchedFleet:
         if self._law is not None:
             self._law.report()
 
-    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
-        del blends
-        return controls
+    def bound(self, controls: Records, blends: Records) -> None:
+        """Nothing to do: they follow any command within the scenario's limits."""
 
     def locate(self, history: StateHistory) -> None:
         """Nothing to do: all frames are the same."""
@@ -129,6 +134,6 @@ class LaunchedFleet:
     def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - their response is known
         return ""
 
-    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
+    def set_points(self, orders: Orders, phase: Phase) -> Records:
         del phase  # they take set-points in formation flight only
-        return self.loop.set_point(self.vehicles[row].system_id, order) if order.commanded else None
+        return self.loop.set_points(orders)

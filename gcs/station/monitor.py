@@ -14,15 +14,22 @@ When the link recovers, these actions are undone in the reverse order.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isnan, nan
+from math import inf, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gcs.control.law import Blend
+from gains.core.arrays import FloatArray
+from gcs.control.law import unblended
 from gcs.control.loop_delay import headroom
 from gcs.control.tick import Mode
+from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import Monitor
+
+_AWAY = (Mode.FAILSAFE, Mode.LOST)
+_TROUBLED = (Mode.CRITICAL, *_AWAY)
+_headroom = kernel(headroom)
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,11 @@ class VehicleState:
     eased_s: float | None = None
     """Since when headroom has been high enough for faster gains; None if it is not."""
     released: bool = False
+
+    @property
+    def at_ease(self) -> bool:
+        """Whether it is NOMINAL and no timer runs."""
+        return self.mode is Mode.NOMINAL and self.pressed_s is None and self.eased_s is None
 
 
 class Observation(NamedTuple):
@@ -104,9 +116,8 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
 
 
 def _is_calm(state: VehicleState, loop_delay_s: float, margins_s: tuple[float, ...], policy: Monitor) -> bool:
-    """Whether the vehicle is NOMINAL, its headroom enough or unknown, and no timer runs: true of most ticks."""
-    nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
-    return nominal and not headroom(loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
+    """Whether the vehicle is at ease and its headroom enough or unknown: true of most ticks."""
+    return state.at_ease and not headroom(loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 
 
 def _by_headroom(
@@ -159,6 +170,29 @@ def _calm_mode(state: VehicleState, own: float, *, blending: bool, policy: Monit
             return state.mode
 
 
+@kernel
+def _not_calm(
+    at_ease: Array, guided: Array, silent: Array, delays_s: Array, seen: int, rank: int, margins_s: Array,
+    gain_sets: Array, caution: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """The vehicles that are not heard, guided and at ease, or are short of headroom.
+
+    Headroom is judged by the delay of a rank among those seen of each vehicle.
+    """
+    rows, found = np.empty(len(at_ease), np.int64), 0
+    for row in range(len(at_ease)):
+        known, enough, margin_s = 0, 0, margins_s[row, gain_sets[row]]
+        for place in range(seen):
+            delay_s = delays_s[row, place]
+            known += not isnan(delay_s)
+            enough += _headroom(delay_s, margin_s) >= caution
+        calm = at_ease[row] and guided[row] and not silent[row]
+        if not calm or (known > rank and enough <= rank):
+            rows[found] = row
+            found += 1
+    return rows[:found]
+
+
 def _changed(state: VehicleState, gain_set: int, now_s: float) -> VehicleState:
     if gain_set == state.gain_set:
         return state
@@ -186,25 +220,32 @@ class FormationMonitor:
         self, vehicles: int, margins_s: tuple[float, ...], policy: Monitor, *, separable: bool, period_s: float
     ) -> None:
         self.states = [VehicleState() for _ in range(vehicles)]
-        self.margins_s = [margins_s] * vehicles
-        """For each vehicle, how much of its loop delay each gain set tolerates."""
+        self.modes, self.gain_sets = np.zeros(vehicles, np.int64), np.zeros(vehicles, np.int64)
+        """Those of `states`."""
+        self.released = np.zeros(vehicles, np.bool_)
+        self.margins_s = np.tile(margins_s, (vehicles, 1))
+        """How much of its loop delay each gain set tolerates, (vehicles, sets)."""
         self.opening = 1.0
         """Factor on the formation's spacing."""
         self._policy = policy
         self._separable = separable
         self._period_s = period_s
-        self._delays_s = np.full((max(1, round(policy.window_s / period_s)), vehicles), np.nan)
+        self._delays_s = np.full((vehicles, max(1, round(policy.window_s / period_s))), nan)
         self._judged = 0
         """Ticks of this flight so far."""
-        self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
+        self._at_ease = np.zeros(vehicles, np.bool_)
+        self._troubled: dict[int, VehicleState] = {}
+        """Those, by row, on whose account the formation may open."""
+        self._blends, self._settled_s = unblended(vehicles), -inf
+        """The newest blends, and when gains stop changing."""
 
     def update(
         self,
         time_s: float,
-        silent: Sequence[bool],
-        guided: Sequence[bool],
-        failsafe: Sequence[bool],
-        loop_delay_s: Sequence[float],
+        silent: NDArray[np.bool_],
+        guided: NDArray[np.bool_],
+        failsafe: NDArray[np.bool_],
+        loop_delay_s: FloatArray,
         *,
         flying: bool,
     ) -> list[tuple[int, VehicleState, VehicleState]]:
@@ -213,18 +254,18 @@ class FormationMonitor:
         Returns row, old and new state of each vehicle whose mode, gain set or release changed.
         """
         if flying:
-            self._delays_s[self._judged % len(self._delays_s)] = loop_delay_s
+            self._delays_s[:, self._judged % self._delays_s.shape[1]] = loop_delay_s
             self._judged += 1
         else:
             self._judged = 0  # before the flight telemetry is slow and the loop is not closed
-        delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
-        states = list(self.states)
-        each = zip(self.states, delays_s, self.margins_s, silent, guided, failsafe, strict=True)
-        for row, (before, delay_s, margins_s, gone, follows, failed) in enumerate(each):
-            if flying and follows and not gone and _is_calm(before, delay_s, margins_s, self._policy):
-                continue  # what `monitored` would say, for the price of a comparison
-            seen = Observation(time_s, flying, gone, follows, failed, delay_s)
+        states, rows = [*self.states], self._not_calm(silent, guided, flying=flying)
+        delays_s = self._judged_delay_s() if rows else np.empty(0)
+        for row in rows:
+            before, margins_s = self.states[row], tuple(self.margins_s[row].tolist())
+            seen = Observation(
+                time_s, flying, bool(silent[row]), bool(guided[row]), bool(failsafe[row]), delays_s.item(row)
+            )
             after = monitored(before, seen, margins_s, self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():
@@ -232,30 +273,70 @@ class FormationMonitor:
                 if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                     changes.append((row, before, after))
                 states[row] = after
+                self._note(row, after)
         self.states = states
         self._open(time_s, flying=flying)
         return changes
 
-    def blends(self, time_s: float) -> list[Blend]:
-        """The gains that each vehicle is flown with."""
-        blend_s = self._policy.blend_s
-        return [
-            Blend(s.gain_set, s.former_set, min(1.0, max(0.0, (time_s - s.changed_s) / blend_s)))
-            if time_s - s.changed_s < blend_s
-            else self._settled[s.gain_set]
-            for s in self.states
-        ]
+    def _note(self, row: int, state: VehicleState) -> None:
+        self.modes[row], self.gain_sets[row], self.released[row] = state.mode, state.gain_set, state.released
+        self._at_ease[row] = state.at_ease
+        if state.mode in _TROUBLED:
+            self._troubled[row] = state
+        else:
+            self._troubled.pop(row, None)
+        self._settled_s = inf
 
-    def _judged_delay_s(self) -> list[float]:
-        count = min(self._judged, len(self._delays_s))
-        if count == 0:
-            return [nan] * len(self.states)
-        # NaN sorts last: a vehicle with more than a tenth of unknown ticks has an unknown delay.
-        rank = min(count - 1, int(0.9 * count))
-        judged: list[float] = np.partition(self._delays_s[:count], rank, axis=0)[rank].tolist()
-        if self._separable:
-            return judged
-        return [nan if any(map(isnan, judged)) else max(judged)] * len(judged)
+    def blends(self, time_s: float) -> Records:
+        """The gains (n, BLEND) that each vehicle is flown with."""
+        blend_s = self._policy.blend_s
+        if time_s >= self._settled_s:
+            return self._blends
+        self._blends = unblended(len(self.states))
+        self._settled_s = -inf
+        for row, s in enumerate(self.states):
+            share = 1.0
+            if time_s - s.changed_s < blend_s:
+                share, self._settled_s = min(1.0, max(0.0, (time_s - s.changed_s) / blend_s)), inf
+            self._blends[row] = s.gain_set, s.former_set if share < 1.0 else s.gain_set, share
+        return self._blends
+
+    @property
+    def away(self) -> list[int]:
+        """The vehicles that do not follow their commands, by row."""
+        return [row for row, state in self._troubled.items() if state.mode in _AWAY]
+
+    def _not_calm(self, silent: NDArray[np.bool_], guided: NDArray[np.bool_], *, flying: bool) -> Sequence[int]:
+        """The vehicles of which `monitored` may say something new."""
+        if not flying:
+            return range(len(self.states))
+        delays_s, seen, rank = self._delays_s, self._seen, self._rank
+        if not self._separable:
+            delays_s, seen, rank = self._judged_delay_s()[:, None], 1, 0
+        rows: list[int] = _not_calm(
+            self._at_ease, guided, silent, delays_s, seen, rank, self.margins_s, self.gain_sets,
+            self._policy.caution_headroom,
+        ).tolist()  # fmt: skip
+        return rows
+
+    @property
+    def _seen(self) -> int:
+        """How many ticks count."""
+        return min(self._judged, self._delays_s.shape[1])
+
+    @property
+    def _rank(self) -> int:
+        """The place of the judged delay among those in ascending order, NaN last.
+
+        So a vehicle with more than a tenth of unknown ticks has an unknown delay.
+        """
+        return min(self._seen - 1, int(0.9 * self._seen))
+
+    def _judged_delay_s(self) -> FloatArray:
+        if not self._seen:
+            return np.full(len(self.states), nan)
+        judged: FloatArray = np.partition(self._delays_s[:, : self._seen], self._rank, axis=1)[:, self._rank]
+        return judged if self._separable else np.full(len(judged), judged.max())
 
     def _next_to_release(self) -> int:
         """The vehicle that may be released now: the CRITICAL one farthest down the tree; -1 if there is none."""
@@ -267,10 +348,10 @@ class FormationMonitor:
 
     def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
-        slowest, troubled = len(self.margins_s[0]) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
+        slowest = self.margins_s.shape[1] - 1
         settled_s = time_s - self._policy.blend_s  # gives the slowest gains time to take effect
         wide = self._policy.act and any(
-            s.gain_set == slowest and s.mode in troubled and s.changed_s < settled_s for s in self.states
+            s.gain_set == slowest and s.changed_s < settled_s for s in self._troubled.values()
         )
         goal = self._policy.open_factor if wide and flying else 1.0
         step = (self._policy.open_factor - 1.0) * self._period_s / self._policy.open_s

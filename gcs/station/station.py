@@ -4,37 +4,35 @@ One loop: receive, decide, command, record. No socket, clock or file is touched 
 or in virtual time, with the same bytes.
 """
 
-from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import hypot, isfinite, nan
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl, distances_m
+from gains.core.arrays import FloatArray
+from gcs.control.law import nearest
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
-from gcs.control.loops import Moment, Order
+from gcs.control.loops import Moment, Orders
 from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import SILENCE_S, RemoteVehicle
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle, requests_to
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.mismatch import Tolerated
-from gcs.station.absence import absence, describe_change, end_reason
+from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
 from gcs.station.monitor import FormationMonitor
-from gcs.station.tick_rows import Reported, Tick, tick_rows
+from gcs.station.reception import Reception
+from gcs.station.tick_rows import Judged, Tick, tick_rows
+from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import NS_PER_S
 
-AUTOPILOT_COMPONENT = 1
-"""A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
-ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
 _REQUESTS_APART_NS = 7_000_000
 """Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
@@ -57,19 +55,20 @@ class Station:
         self._journal = journal = Journal(start_ns, patience_s(scenario))
         self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
         """See `Journal`."""
-        self.frames: list[tuple[bytes, int]] = []
-        """Frames received since the driver last took them, each with the time at which it was received."""
-        self.counters: Counter[str] = Counter()
         self._fleet = fleet_of(plan, journal.report, LawHooks(journal.request_stop, journal.note_law, stopwatch_ns))
         self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
-        self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
-        self._history = StateHistory(n)
+        self._period_ns = round(NS_PER_S / rates.control_hz)
+        self._reception = Reception(self._fleet, journal.report, start_ns=start_ns, period_ns=self._period_ns)
+        self._history = self._reception.history
+        self.frames, self.counters, self.is_another = (
+            self._reception.frames, self._reception.counters, self._reception.is_another
+        )  # fmt: skip
+        """See `Reception`."""
         self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
         self._has_slots = scenario.has_altitude_slots
         self._limits = SetPointLimits.of(scenario.limits)
-        self._period_ns = round(NS_PER_S / rates.control_hz)
         period_s = self._period_ns / NS_PER_S
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
@@ -88,11 +87,17 @@ class Station:
         self._timesync_row = 0
         self._tick_count = 0
         self._now_ns = start_ns
-        self._reported = [Reported()] * n
         self._repetitions = Repetitions(rates, n)
-        self._telemetry_ns = [0] * n
-        self._fresh_rtt_s = [deque[float]() for _ in range(n)]
-        self._used_s = [nan] * n
+        self._used_s = np.full(n, nan)
+        self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
+        measured = scenario.control.prediction == "measured"
+        self._tolerated = None if measured else self._tolerances(np.zeros(n))
+        """The tolerances of every tick, if they do not depend on a measured delay."""
+        self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        self._why_absent = [""] * n
+        """Why each vehicle is absent, unless it is silent."""
+        self._busy = set(range(n))
+        """Vehicles for which a command may be due."""
         self._absent = [""] * n
         self._returning: dict[int, bool] = {}
         """Vehicles that take part again, by row, and whether they were far from their places when last looked at. The
@@ -116,18 +121,15 @@ class Station:
         datagrams are sent.
         """
         self._now_ns = self._journal.now_ns = now_ns
-        outgoing: list[Outgoing] = []
-        for datagram in datagrams:
-            self._receive(datagram, outgoing)
+        outgoing = self._reception.take(datagrams, now_ns)
         if now_ns >= self.next_tick_ns:
             return outgoing, self._tick(outgoing)  # set-points do not wait for what may come in a step of its own
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
             for vehicle in self.vehicles:
-                self._send(vehicle, mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
+                vehicle.send(mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
         if now_ns >= self._next_requests_ns:
-            while now_ns >= self._next_timesync_ns:
-                self._request_timesync(outgoing)
+            self._request_timesync(outgoing)
             self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
         return outgoing, None
 
@@ -137,120 +139,17 @@ class Station:
         `sent_ns` says when each datagram of the step was sent. What set-points need not wait for is judged here:
         whether the formation is broken, and who is back near its place.
         """
-        slots_m = [reported.down_m for reported in tick.reported] if self._has_slots else None
-        distance_m = distances_m(tick.controls, tick.due_ns, slots_m)
-        nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
+        judged = tick.judged
+        near = nearest(judged.controls, tick.due_ns, judged.reported["down_m"] if self._has_slots else None)
         if self.phase is Phase.FLYING:
-            self._take_back(tick.controls)
-            self.request_stop(
-                self._breakage.judge(tick.controls, tick.monitored, self._absent, distance_m, nearest_m, tick.time_s)
-            )
+            self._take_back(judged.controls)
+            away = dict.fromkeys(self._monitor.away, False)
+            away |= {row: why in PILOTED for row, why in enumerate(self._absent) if why}
+            self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
         newest_ns = sent_ns[-1] if sent_ns else self._now_ns
-        own_ns = [newest_ns if index < 0 else sent_ns[index] for index in tick.set_point_indices]
-        rows, self._used_s = tick_rows(tick, nearest_m, own_ns)
+        own_ns = np.array([newest_ns if index < 0 else sent_ns[index] for index in tick.set_point_indices])
+        rows, self._used_s = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
         return rows
-
-    def is_another(self, system_id: int, datagram: Datagram) -> bool:
-        """Whether a frame claims the system id of a vehicle that is known to send from another address."""
-        row = self._row.get(system_id)
-        return row is not None and self.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
-
-    # -- receive ---------------------------------------------------------------------------------------------------
-
-    def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
-        if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
-            # once answered in MAVLink 2, the vehicle uses that
-            frames = mavlink.first_heartbeats(datagram.data, self.counters)
-        else:
-            frames = mavlink.decode(datagram.data, self.counters)
-        for frame in frames:
-            row = self._row.get(frame.system_id)
-            if row is None:
-                self.counters["unknown system id"] += 1
-                continue
-            vehicle = self.vehicles[row]
-            if vehicle.address != datagram.address:
-                if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
-                    self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
-                    continue
-                vehicle.address = datagram.address
-                self._report("vehicle", "found", vehicle.system_id)
-            vehicle.heard_ns = datagram.received_ns
-            vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
-            self.frames.append((frame.data, datagram.received_ns))
-            if frame.component_id != AUTOPILOT_COMPONENT:
-                self.counters["other component"] += 1
-                continue
-            if vehicle.is_replay(frame, datagram.received_ns):
-                continue
-            self._handle(row, vehicle, frame, datagram, outgoing)
-
-    def _handle(
-        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
-    ) -> None:
-        fields = frame.fields
-        match frame.msg_id:
-            case mavlink.LOCAL_POSITION_NED:
-                self._position(row, vehicle, frame, datagram, outgoing)
-            case mavlink.POSITION_TARGET_LOCAL_NED:
-                at_ns = vehicle.clock.station_ns(fields[0], datagram.received_ns)
-                if at_ns is not None:
-                    self._fleet.loop.active(row, at_ns, fields)
-            case mavlink.TIMESYNC:
-                tc1_ns, ts1_ns = fields
-                if tc1_ns == 0:
-                    reply = mavlink.timesync(tc1_ns=datagram.received_ns, ts1_ns=ts1_ns)
-                    self._send(vehicle, mavlink.TIMESYNC, reply, outgoing)
-                else:
-                    self._timesync_reply(row, vehicle, tc1_ns, ts1_ns, datagram.received_ns)
-            case mavlink.HEARTBEAT:
-                vehicle.heartbeat(fields, datagram.received_ns)
-            case mavlink.COMMAND_ACK:
-                vehicle.acknowledge(fields, datagram.received_ns)
-            case mavlink.NAMED_VALUE_INT:
-                vehicle.named_int(fields)
-            case mavlink.STATUSTEXT:
-                text = fields[1].split(b"\0")[0].decode(errors="replace")
-                if vehicle.startup.is_news(text):
-                    self._report("statustext", text, vehicle.system_id)
-            case _:
-                pass
-        vehicle.startup.take(frame.msg_id, fields)
-
-    def _position(
-        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
-    ) -> None:
-        boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
-        clock = vehicle.clock
-        sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
-        if vehicle.left_out:
-            return  # on the ground, others may fly over it
-        if sample_ns is None:
-            if not clock.exchange_due:
-                self._telemetry_ns[row] = datagram.received_ns  # heard before the first exchange
-            elif self._now_ns - clock.asked_ns >= self._period_ns:
-                self._exchange(vehicle, outgoing)
-            return
-        origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
-        if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
-            return
-        self._telemetry_ns[row] = datagram.received_ns  # new states only: a replay does not end a silence
-        bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
-        queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
-        self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
-
-    def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
-        jumps = vehicle.clock.jumps
-        rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
-        if rtt_ns is not None:
-            self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
-            key_ms = (ts1_ns - self._start_ns) // 1_000_000
-            delivery_ns = vehicle.delivery_ns(key_ms, self._start_ns + key_ms * 1_000_000)
-            self._fleet.loop.delivered(row, delivery_ns or 0, ts1_ns)
-        if vehicle.clock.jumps != jumps:
-            self._history.forget(row)
-            vehicle.begin_anew()
-            self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
@@ -267,46 +166,55 @@ class Station:
         blends = self._monitor.blends(time_s)
         now = Moment(due_ns, time_s, nominal_m_s, self._monitor.opening)
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
-        controls = self._fleet.bounded(controls, blends)
-        controls = [self._limited(control) for control in controls]
+        self._fleet.bound(controls, blends)
+        self._limits.limit_commands(controls["command_m_s2"])
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
-        followed: list[bool] = []
-        indices: list[int] = []
-        tolerated: list[Tolerated] = []
-        for row, (vehicle, control, monitored) in enumerate(
-            zip(self.vehicles, controls, self._monitor.states, strict=True)
-        ):
-            north, east = control.command_m_s2
-            commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
-            order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
-            fields = self._fleet.set_point(row, order, self.phase)
-            index = len(outgoing)
-            if fields is not None:
-                fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
-                self._fleet.loop.sent(row, due_ns, fields)
-                self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
-            indices.append(index if len(outgoing) > index else -1)
-            followed.append(commanded)
-            tolerated.append(self.plan.tolerance(control.assumed_s))
-        self._monitor.margins_s = [each.longer_s for each in tolerated]
-        for vehicle in self.vehicles:
-            frame = vehicle.next_frame(self._now_ns)
-            if frame is not None and vehicle.address is not None:
-                outgoing.append((frame, vehicle.address))
-        tick = Tick(
-            self._tick_count, time_s, due_ns, key_ms, self.vehicles, self._monitor.states, controls,
-            self._reported.copy(), [fresh_s.popleft() if fresh_s else nan for fresh_s in self._fresh_rtt_s],
-            followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns), indices,
+        commanded = _commanded(controls, self._monitor.released, flying)
+        orders = Orders(controls, commanded, nominal_m_s, due_ns)
+        points = self._fleet.set_points(orders, self.phase)
+        self._limits.limit(points)  # last, so that it holds whoever computed them
+        self._fleet.loop.sent(due_ns, points)
+        indices = self._send_set_points(points, key_ms, outgoing)
+        for row in sorted(self._busy):
+            frame = self.vehicles[row].next_frame(self._now_ns)
+            if frame is not None and (address := self.vehicles[row].address) is not None:
+                outgoing.append((frame, address))
+            if self.vehicles[row].idle:
+                self._busy.discard(row)
+        shorter_s, self._monitor.margins_s = self._tolerated or self._tolerances(controls["assumed_s"])
+        judged = Judged(
+            self._system_ids, self._monitor.modes, self._monitor.gain_sets, controls,
+            self._reception.reported, self._reception.fresh_rtt_s(), commanded,
+            shorter_s, self._monitor.margins_s, self._repetitions.repeated_s(controls["used_ns"], due_ns),
         )  # fmt: skip
+        tick = Tick(self._tick_count, time_s, due_ns, key_ms, judged, indices)
         self._tick_count += 1 + behind
         return tick
 
-    def _take_back(self, controls: Sequence[VehicleControl]) -> None:
+    def _send_set_points(self, points: Records, key_ms: int, outgoing: list[Outgoing]) -> list[int]:
+        """Add the set-points to the datagrams to be sent; returns their indices there, -1 for none."""
+        links = self._fleet.links.known
+        rows = (points["sent"] & (links["address"] >= 0)).nonzero()[0]
+        frames = mavlink.set_point_frames(points, rows, links["sequence"], self._system_ids, key_ms)
+        indices = [-1] * len(points)
+        for row, frame in zip(rows.tolist(), frames, strict=True):
+            address = self.vehicles[row].address
+            assert address is not None
+            indices[row] = len(outgoing)
+            outgoing.append((frame, address))
+        return indices
+
+    def _tolerances(self, assumed_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
+        each = [*map(self.plan.tolerance, assumed_s.tolist())]
+        return np.array([own.shorter_s for own in each]), np.array([own.longer_s for own in each])
+
+    def _take_back(self, controls: Records) -> None:
         """Let the others fly again with vehicles that have come near their places."""
         near_m = _NEAR * self.plan.scenario.safety.spacing_error_limit_m
         for row, was_far in [*self._returning.items()]:
             control = controls[row]
-            if not control.sample_ns or hypot(*control.spacing_error_m) > near_m:
+            if not control["sample_ns"] or hypot(*control["spacing_error_m"].tolist()) > near_m:
                 self._returning[row] = True
                 continue
             del self._returning[row]  # near, or with nobody ahead to be far from
@@ -319,17 +227,15 @@ class Station:
             [why != "" for why in self._absent], [row in self._returning for row in range(len(self._absent))]
         )
 
-    def _limited(self, control: VehicleControl) -> VehicleControl:
-        command_m_s2 = self._limits.command(control.command_m_s2)
-        return control if command_m_s2 is control.command_m_s2 else control._replace(command_m_s2=command_m_s2)
-
     def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
         """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
-        silence_ns = SILENCE_S * NS_PER_S
-        silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
-        both = zip(self.vehicles, silent, strict=True)
-        absent = [absence(vehicle, gone=gone) if flying else "" for vehicle, gone in both]
+        silent = self._now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
+        self._look_at(self._reception.touched if flying else range(len(self.vehicles)))
+        self._reception.touched.clear()
+        absent = [*self._why_absent] if flying else [""] * len(self.vehicles)
+        for row in silent.nonzero()[0].tolist() if flying else ():
+            absent[row] = absent[row] if absent[row] == LEFT_OUT else LOST
         if absent != self._absent:
             for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
                 if now != was and flying:
@@ -342,14 +248,12 @@ class Station:
             self._absent = absent
             self._set_law()
         time_s = self.scenario_time_s(due_ns)
-        guided, critical = (
-            [vehicle.guided for vehicle in self.vehicles],
-            [vehicle.critical for vehicle in self.vehicles],
-        )
-        for row, before, after in self._monitor.update(time_s, silent, guided, critical, self._used_s, flying=flying):
+        changes = self._monitor.update(time_s, silent, self._guided, self._critical, self._used_s, flying=flying)
+        for row, before, after in changes:
             vehicle = self.vehicles[row]
             if flying:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
+                self._busy.add(row)
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
                 self._tell(vehicle, after.mode, after.mode.name, outgoing)
@@ -362,15 +266,27 @@ class Station:
                 self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
         self._next_phase(due_ns)
 
+    def _look_at(self, rows: Iterable[int]) -> None:
+        """Take in what may have changed of vehicles."""
+        for row in rows:
+            vehicle = self.vehicles[row]
+            self._guided[row], self._critical[row] = vehicle.guided, vehicle.critical
+            self._why_absent[row] = absence(vehicle, gone=False)
+            self._busy.add(row)
+
     def _next_phase(self, due_ns: int) -> None:
         waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
         if self.phase is Phase.CONNECTING:
             self.request_stop(self._fleet.startup_failure(due_ns, self._start_ns, self._history))
         if self.phase is Phase.IDENTIFYING:
             self.request_stop(self._fleet.identify(due_ns, self._history))
-            self.plan = self._fleet.plan
+            if self.plan is not self._fleet.plan:
+                self.plan = self._fleet.plan
+                self._tolerated = self._tolerated and self._tolerances(np.zeros(len(self.vehicles)))
         if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
+        if self.phase is Phase.FLYING and not self._journal.stop:
+            return
         all_ready = self.phase is Phase.CONNECTING and all(
             v.left_out or (v.ready and self._history.newest(row)) for row, v in enumerate(self.vehicles)
         )
@@ -398,28 +314,37 @@ class Station:
             alone = self._journal.stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
                 vehicle.goal = None if alone else Goal.END
+            self._busy.update(range(len(self.vehicles)))
         self._report("phase", str(phase))
 
     # -- sending and reporting -------------------------------------------------------------------------------------
 
     def _request_timesync(self, outgoing: list[Outgoing]) -> None:
-        vehicle = self.vehicles[self._timesync_row]
-        self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
-        self._next_timesync_ns += self._timesync_spacing_ns
-        if vehicle.address is not None:
-            self._exchange(vehicle, outgoing)
-
-    def _exchange(self, vehicle: RemoteVehicle, outgoing: list[Outgoing]) -> None:
-        ts1_ns = vehicle.clock.request(self._now_ns)
-        self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
-
-    def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
-        if vehicle.address is not None:
-            outgoing.append((vehicle.encode(msg_id, fields), vehicle.address))
+        """Ask the vehicles whose turn has come for the time on their clocks."""
+        rows: list[int] = []
+        while self._now_ns >= self._next_timesync_ns:
+            rows.append(self._timesync_row)
+            self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
+            self._next_timesync_ns += self._timesync_spacing_ns
+        known = [row for row in rows if self.vehicles[row].address is not None]
+        for row, frame in zip(known, requests_to(self._fleet.links, known, self._now_ns), strict=True):
+            address = self.vehicles[row].address
+            assert address is not None
+            outgoing.append((frame, address))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""
         if vehicle.external:
             return
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
-        self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
+        vehicle.send(mavlink.STATUSTEXT, fields, outgoing)
+
+
+@kernel
+def _commanded(controls: Records, released: Array, flying: bool) -> NDArray[np.bool_]:
+    """Which vehicles are to follow the control law."""
+    commanded = np.empty(len(controls), np.bool_)
+    for row in range(len(controls)):
+        command = controls[row].command_m_s2
+        commanded[row] = flying and not released[row] and isfinite(command[0]) and isfinite(command[1])
+    return commanded

@@ -1,101 +1,112 @@
-"""Packs the rows of the tick record from what the station knows at a tick."""
+"""Fills the rows of the tick record from what the station knows at a tick."""
 
-import struct
 from collections.abc import Sequence
 from math import nan
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gcs.control.law import VehicleControl
+from gains.core.arrays import FloatArray
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.control.tick import TICK, TickArray
-from gcs.link.vehicle import RemoteVehicle
-from gcs.plan.mismatch import Tolerated
-from gcs.station.monitor import VehicleState
+from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, offset_at_ns
+from gcs.link.vehicle import Links, delivery_ns
+from gcs.plan.mismatch import used_s
+from scenarios.kernel import Array, Records, kernel
 
-_CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
-_ROW = struct.Struct("<" + "".join(_CODES[np.dtype(TICK[name]).str] for name in TICK.names or ()))
+_headroom, _loop_delay_s, _used_s = kernel(headroom), kernel(loop_delay_s), kernel(used_s)
 
 
-class Reported(NamedTuple):
-    """What came with a vehicle's newest state."""
+class Judged(NamedTuple):
+    """What the monitor and the control law say of n vehicles at a tick, as arrays of n."""
 
-    boot_ms: int = 0
-    down_m: float = nan
-    velocity_down_m_s: float = nan
-    queue_s: float = nan
-    received_ns: int = 0
-    """The kernel's stamp."""
-    bound_s: float = nan
-    """The largest error of the instant at which the state was sampled."""
+    system_id: NDArray[np.int64]
+    mode: NDArray[np.int64]
+    gain_set: NDArray[np.int64]
+    controls: Records
+    """Of `gcs.control.law.CONTROL`."""
+    reported: Records
+    """Of `gcs.station.reception.REPORTED`."""
+    rtt_s: FloatArray
+    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
+    commanded: NDArray[np.bool_]
+    shorter_s: FloatArray
+    """How far the loop delay may be from the assumed delay, (n, sets): see `gcs.plan.mismatch.Tolerated`."""
+    longer_s: FloatArray
+    repeated_s: FloatArray
+    """See `gcs.control.loop_delay.Repetitions`."""
 
 
 class Tick(NamedTuple):
-    """One control tick of the formation, before its set-points are sent. Lists have a place for each vehicle."""
+    """One control tick of the formation, before its set-points are sent."""
 
     number: int
     time_s: float
     due_ns: int
     key_ms: int
-    vehicles: Sequence[RemoteVehicle]
-    monitored: Sequence[VehicleState]
-    controls: Sequence[VehicleControl]
-    reported: Sequence[Reported]
-    rtt_s: Sequence[float]
-    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
-    commanded: Sequence[bool]
-    tolerated: Sequence[Tolerated]
-    """How far the loop delay may be from the assumed delay."""
-    repeated_s: Sequence[float]
-    """See `gcs.control.loop_delay.Repetitions`."""
+    judged: Judged
     set_point_indices: Sequence[int]
-    """Index of the vehicle's set-point among the datagrams of the step; -1 if it was sent none."""
+    """For each vehicle the index of its set-point among the datagrams of the step; -1 if it was sent none."""
 
 
-def tick_rows(tick: Tick, nearest_m: Sequence[float], sent_ns: Sequence[int]) -> tuple[TickArray, list[float]]:
+def tick_rows(
+    tick: Tick, links: Links, nearest_m: FloatArray, sent_ns: NDArray[np.int64]
+) -> tuple[TickArray, FloatArray]:
     """The rows of a tick, and how much of its margin each vehicle uses.
 
     `nearest_m` holds each vehicle's distance to the nearest other, NaN while unknown, and `sent_ns` when its set-point
-    was handed to the kernel. What is used is in s, see `gcs.plan.mismatch.Tolerated.used_s`: the loop delay, or the
-    mismatch with prediction.
+    was handed to the kernel. What is used is in s, see `gcs.plan.mismatch.used_s`: the loop delay, or the mismatch with
+    prediction.
     """
-    packed: list[bytes] = []
-    every_used_s: list[float] = []
-    for vehicle, monitored, control, reported, rtt_s, commanded, tolerated, repeated_s, near_m, own_ns in zip(
-        *tick[4:-1], nearest_m, sent_ns, strict=True
-    ):
-        clock, frames = vehicle.clock, vehicle.frames
-        estimate = clock.estimate
-        age_s = (own_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
-        up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+    rows, used = np.empty(len(sent_ns), TICK), np.empty(len(sent_ns))
+    _fill(rows, used, links.known, links.clocks.known, links.counters, tick.judged, nearest_m, sent_ns, *tick[:4])
+    return rows, used
+
+
+@kernel
+def _fill(
+    rows: Records, used: Array, links: Records, clocks: Records, counters: Records, judged: Judged,
+    nearest_m: Array, sent_ns: Array, number: int, time_s: float, due_ns: int, key_ms: int,
+) -> None:  # fmt: skip
+    for k in range(len(rows)):
+        row, control, reported = rows[k], judged.controls[k], judged.reported[k]
+        clock, counter, own_ns = clocks[k], counters[k], sent_ns[k]
+        row.tick, row.time_s, row.due_ns, row.sent_ns = number, time_s, due_ns, own_ns
+        row.key_ms, row.system_id = key_ms, judged.system_id[k]
+        row.mode, row.gain_set, row.commanded = judged.mode[k], judged.gain_set[k], judged.commanded[k]
+        row.sample_boot_ms, row.sample_ns = reported.boot_ms, control.sample_ns
+        known = control.sample_ns > 0
+        row.telemetry_age_s = (own_ns - control.sample_ns) * 1e-9 if known else nan
+        row.up_delay_s = (reported.received_ns - control.sample_ns) * 1e-9 if known else nan
+        row.north_m, row.east_m, row.down_m = control.state[0], control.state[1], reported.down_m
+        row.velocity_north_m_s, row.velocity_east_m_s = control.state[2], control.state[3]
+        row.velocity_down_m_s = reported.velocity_down_m_s
+        row.spacing_error_north_m, row.spacing_error_east_m = control.spacing_error_m[0], control.spacing_error_m[1]
+        row.velocity_error_north_m_s = control.velocity_error_m_s[0]
+        row.velocity_error_east_m_s = control.velocity_error_m_s[1]
+        row.command_north_m_s2 = control.command_m_s2[0] if row.commanded else nan
+        row.command_east_m_s2 = control.command_m_s2[1] if row.commanded else nan
+        row.nearest_m, row.queue_s, row.sample_bound_s = nearest_m[k], reported.queue_s, reported.bound_s
         down_s = down_bound_s = loop_bound_s = nan
-        down_ns = vehicle.delivery_ns(tick.key_ms, own_ns)
-        if down_ns is not None:
+        down_ns = delivery_ns(links[k], clock, key_ms, own_ns)
+        if down_ns != UNKNOWN:
             down_s, down_bound_s = down_ns * 1e-9, clock.down_bound_ns * 1e-9
             loop_bound_s = clock.loop_bound_ns * 1e-9 if control.used_ns == control.sample_ns else nan
-        offset_s = bound_s = nan
-        if estimate.samples > 0:
-            offset_s, bound_s = estimate.offset_at_ns(own_ns) * 1e-9, estimate.bound_at_ns(own_ns) * 1e-9
-        loop_s = loop_delay_s(control.used_ns, own_ns, down_s, repeated_s)
-        margin_s = tolerated.longer_s[monitored.gain_set]
+        row.down_delay_s, row.down_bound_s, row.loop_delay_bound_s = down_s, down_bound_s, loop_bound_s
+        row.clock_offset_s = row.clock_offset_bound_s = nan
+        if clock.samples:
+            estimate = estimate_of(clock)
+            row.clock_offset_s = offset_at_ns(estimate, own_ns) * 1e-9
+            row.clock_offset_bound_s = bound_at_ns(estimate, own_ns) * 1e-9
+        repeated_s = judged.repeated_s[k]
+        loop_s = _loop_delay_s(control.used_ns, own_ns, down_s, repeated_s)
+        margin_s = judged.longer_s[k, judged.gain_set[k]]
         # the age of a state is known, so only a set-point that acts at another instant than assumed is a mismatch
         mismatch_s = (own_ns - control.acts_ns) * 1e-9 + down_s if control.acts_ns > 0 else loop_s
-        used_s = tolerated.used_s(monitored.gain_set, mismatch_s)
-        every_used_s.append(used_s)
-        packed.append(
-            _ROW.pack(
-                tick.number, tick.time_s, tick.due_ns, own_ns, tick.key_ms, vehicle.system_id,
-                monitored.mode, monitored.gain_set, commanded,
-                reported.boot_ms, control.sample_ns, age_s,
-                *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
-                *control.spacing_error_m, *control.velocity_error_m_s,
-                *(control.command_m_s2 if commanded else (nan, nan)),
-                near_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
-                loop_s, loop_bound_s, repeated_s, control.assumed_s, control.assumed_s + margin_s,
-                headroom(used_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
-                offset_s, bound_s,
-                frames.received, frames.lost, frames.late, frames.duplicate,
-            )
-        )  # fmt: skip
-    return np.frombuffer(bytearray().join(packed), TICK), every_used_s
+        used[k] = _used_s(judged.shorter_s[k, judged.gain_set[k]], margin_s, mismatch_s)
+        row.loop_delay_s, row.repeated_s, row.rtt_s = loop_s, repeated_s, judged.rtt_s[k]
+        row.assumed_delay_s, row.delay_margin_s = control.assumed_s, control.assumed_s + margin_s
+        row.headroom = _headroom(used[k], margin_s) if margin_s > 0.0 else nan
+        row.received, row.lost = counter.received, counter.lost
+        row.late, row.duplicate = counter.late, counter.duplicate

@@ -11,7 +11,7 @@ from functools import partial
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
 from gcs.views.console import draw, live_display
-from gcs.watch.links import Requests, Watch, WatchReport
+from gcs.watch.links import Requests, Watch, WatchReport, prepare
 from gcs.watch.saved_links import LinkRecorder
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S
@@ -41,6 +41,7 @@ def watch_links(
     Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder` notes every frame
     that `watch` takes.
     """
+    prepare()
     requests = Requests(timesync_hz, position_hz)
     start_ns = now_ns = clock_ns()
     end_ns = start_ns + round(seconds * NS_PER_S) if math.isfinite(seconds) else 1 << 62

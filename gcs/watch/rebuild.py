@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gcs.control.history import StateHistory
-from gcs.control.law import Blend, distances_m
+from gcs.control.law import nearest, unblended
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
@@ -28,7 +28,8 @@ from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import VehicleState
-from gcs.station.tick_rows import Reported, Tick, tick_rows
+from gcs.station.reception import new_reported
+from gcs.station.tick_rows import Judged, Tick, tick_rows
 from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -38,7 +39,6 @@ _ANNOUNCED = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
 """Gaps of a log that are longer than this get no ticks."""
 _LEAST_TICKS = 3
-_NO_BLEND = Blend()
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class _Rebuilding:
         self._lost = [False] * len(ids)
         self._law = self._fleet.loop.law(self._lost)
         self._telemetry_ns = [0] * len(ids)
-        self._reported = [Reported()] * len(ids)
+        self._reported = new_reported(len(ids))
         self._states = [VehicleState()] * len(ids)
         self._jumps = [0] * len(ids)
         self._exchanges = [0] * len(ids)
@@ -255,10 +255,10 @@ class _Rebuilding:
             return
         else:
             sample_ns = boot_ms * 1_000_000 + vehicle.least_delay_ns
-        origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
+        origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row].tolist()
         if self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             self._telemetry_ns[row] = time_ns
-            self._reported[row] = Reported(boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s)
+            self._reported[row] = boot_ms, down + origin_down, v_down, nan, time_ns, bound_s
 
     def _tick(self, due_ns: int, commands: _Commands, key_ms: int) -> None:
         """The rows of one tick, from what the station knew when it sent these set-points."""
@@ -271,20 +271,22 @@ class _Rebuilding:
         if lost != self._lost:
             self._lost, self._law = lost, self._fleet.loop.law(lost)
         now = Moment(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
-        controls = self._fleet.loop.control(self._history, self._law, [_NO_BLEND] * len(lost), now)
-        slots_m = [reported.down_m for reported in self._reported] if self._scenario.has_altitude_slots else None
-        nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns, slots_m), axis=1).tolist()
-        remotes = [vehicle.remote for vehicle in self._vehicles]
-        sent = [commands.get(remote.system_id, (sent_ns, None)) for remote in remotes]
-        tick = Tick(
-            round((due_ns - self._start_ns) / self._period_ns), time_s, due_ns, key_ms, remotes, self._states,
-            [each._replace(command_m_s2=one or (nan, nan)) for each, (_, one) in zip(controls, sent, strict=True)],
-            self._reported, [self._fresh_rtt_s(row, vehicle) for row, vehicle in enumerate(self._vehicles)],
-            [one is not None for _, one in sent],
-            [self._fleet.plan.tolerance(control.assumed_s) for control in controls],
-            self._repetitions.repeated_s([control.used_ns for control in controls], due_ns), (),
+        controls = self._fleet.loop.control(self._history, self._law, unblended(len(lost)), now)
+        near = nearest(controls, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else None)
+        ids = [vehicle.remote.system_id for vehicle in self._vehicles]
+        sent = [commands.get(system_id, (sent_ns, None)) for system_id in ids]
+        controls["command_m_s2"] = [one or (nan, nan) for _, one in sent]
+        tolerated = [self._fleet.plan.tolerance(assumed_s) for assumed_s in controls["assumed_s"].tolist()]
+        judged = Judged(
+            np.array(ids), np.array([int(state.mode) for state in self._states]),
+            np.array([state.gain_set for state in self._states]), controls, self._reported,
+            np.array([self._fresh_rtt_s(row, vehicle) for row, vehicle in enumerate(self._vehicles)]),
+            np.array([one is not None for _, one in sent]),
+            np.array([own.shorter_s for own in tolerated]), np.array([own.longer_s for own in tolerated]),
+            self._repetitions.repeated_s(controls["used_ns"], due_ns),
         )  # fmt: skip
-        rows, _ = tick_rows(tick, nearest_m, [own_ns for own_ns, _ in sent])
+        tick = Tick(round((due_ns - self._start_ns) / self._period_ns), time_s, due_ns, key_ms, judged, ())
+        rows, _ = tick_rows(tick, self._fleet.links, near.distance_m, np.array([own_ns for own_ns, _ in sent]))
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:

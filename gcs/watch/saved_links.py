@@ -66,7 +66,7 @@ class LinkRecorder:
             if exchanges > _SETTLED and clock.down_ns is not None:
                 own.down_s.append(clock.down_ns * 1e-9)
                 own.bound_s = max(own.bound_s, clock.down_bound_ns * 1e-9)
-        if exchanges <= _SETTLED or not clock.estimate.samples:
+        if exchanges <= _SETTLED or not clock.samples:
             return
         if frame.msg_id == mavlink.LOCAL_POSITION_NED:
             sampled_ns = clock.estimate.to_station_ns(clock.boot_ns(frame.fields[0], received_ns))

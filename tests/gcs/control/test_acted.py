@@ -18,12 +18,6 @@ START, PERIOD, DOWN = 10 * S, 100 * MS, 250 * MS
 Vector = tuple[float, float]
 
 
-def sent(acceleration: Vector, velocity: Vector = (0.0, 0.0)) -> tuple[Any, ...]:
-    return mavlink.velocity_set_point(
-        key_ms=0, target_system=1, velocity_ned_m_s=(*velocity, 0.0), acceleration_ne_m_s2=acceleration
-    )
-
-
 def active(acceleration: Vector, velocity: Vector | None = None) -> tuple[Any, ...]:
     """Fields of POSITION_TARGET_LOCAL_NED after a trip over the link; without velocity the mask says that."""
     north, east = velocity or (0.0, 0.0)
@@ -42,7 +36,7 @@ class Link:
         self.targets = ActiveTargets(self.history, period_ns=PERIOD, held_ns=S)
         for k, (north, east) in enumerate(self.wanted.tolist()):
             self.history.add(START + k * PERIOD, (north, east))
-            self.targets.sent(START + k * PERIOD, sent((north, east), (east, north)))
+            self.targets.sent(START + k * PERIOD, (east, north), (north, east))
 
     def report(self, tick: int, fields: tuple[Any, ...]) -> None:
         """A report of 30 ms after the set-point of a tick should have acted."""
@@ -175,6 +169,6 @@ def test_a_vehicle_that_stands_tells_nothing_of_set_points() -> None:
     targets = ActiveTargets(history, period_ns=PERIOD, held_ns=S)
     for k, north in enumerate((0.0, 3.0, 4.0, 5.0)):
         history.add(START + k * PERIOD, (north, 0.0))
-        targets.sent(START + k * PERIOD, sent((north, 0.0)))
+        targets.sent(START + k * PERIOD, (0.0, 0.0), (north, 0.0))
         targets.reported(START + k * PERIOD + 10 * MS, active((0.0, 0.0)))
     assert history.sums(START + 4 * PERIOD)[0] == pytest.approx(0.1 * 12.0)

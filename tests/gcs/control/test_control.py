@@ -8,7 +8,7 @@ import pytest
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gcs.control.history import HISTORY, StateHistory
-from gcs.control.law import Blend, feedback_law, formation_control
+from gcs.control.law import feedback_law, formation_control, unblended
 from gcs.control.limits import SetPointLimits
 from gcs.plan.formation import Formation
 
@@ -16,7 +16,8 @@ MS = 1_000_000
 RNG = np.random.default_rng(11)
 K1, K2, K3 = (RNG.normal(size=(2, 2)) for _ in range(3))
 NOBODY = (False,) * 5
-FASTEST = Blend()
+FASTEST = 0, 0, 1.0
+"""Gain set flown, the former one, and the share of the first."""
 # 0 leads; 1 and 2 follow it; 3 follows 1; 4 follows 3
 MODEL = FormationModel((-1, 0, 0, 1, 3))
 TREE = Formation((9, 3, 4, 7, 5), MODEL, np.vstack([np.zeros(2), RNG.normal(size=(4, 2)) * 100]))
@@ -45,15 +46,12 @@ def controlled(
     lost: tuple[bool, ...] = NOBODY,
     *,
     v_d: tuple[float, float] = (1.0, 0.0),
-    blend: Blend = FASTEST,
+    blend: tuple[int, int, float] = FASTEST,
 ) -> Controlled:
-    law = feedback_law(TREE, K, lost)
-    controls = formation_control(history, law, [blend] * 5, nominal_velocity_m_s=v_d)
-    return Controlled(
-        np.array([control.command_m_s2 for control in controls]),
-        np.array([control.spacing_error_m for control in controls]),
-        np.array([control.velocity_error_m_s for control in controls]),
-    )
+    law, blends = feedback_law(TREE, K, lost), unblended(5)
+    blends[:] = blend
+    controls = formation_control(history, law, blends, nominal_velocity_m_s=v_d)
+    return Controlled(*(controls[name] for name in ("command_m_s2", "spacing_error_m", "velocity_error_m_s")))
 
 
 def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
@@ -70,7 +68,8 @@ def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
 def test_others_do_without_a_vehicle_that_returns_by_its_own_law(gain: FloatArray) -> None:
     away = (False, True, False, False, False)
     returning, lost, all_there = (
-        feedback_law(TREE, (gain,), gone, back) for gone, back in ((NOBODY, away), (away, NOBODY), (NOBODY, NOBODY))
+        feedback_law(TREE, (gain,), gone, back).vehicles
+        for gone, back in ((NOBODY, away), (away, NOBODY), (NOBODY, NOBODY))
     )
     assert returning[1] == all_there[1]
     assert [returning[row] for row in (0, 2, 3, 4)] == [lost[row] for row in (0, 2, 3, 4)]
@@ -94,14 +93,15 @@ def test_gains_are_blended_by_their_share() -> None:
     history = filled(RNG.normal(size=(5, 4)) * 10)
     fast, slow = (controlled(history, (K,)).command_m_s2 for K in (OVERLAPPING, OVERLAPPING / 4))
     both = (OVERLAPPING, OVERLAPPING / 4)
-    assert controlled(history, both, blend=Blend(1, 0, 1.0)).command_m_s2 == pytest.approx(slow)
-    assert controlled(history, both, blend=Blend(1, 0, 0.25)).command_m_s2 == pytest.approx(0.25 * slow + 0.75 * fast)
+    assert controlled(history, both, blend=(1, 0, 1.0)).command_m_s2 == pytest.approx(slow)
+    assert controlled(history, both, blend=(1, 0, 0.25)).command_m_s2 == pytest.approx(0.25 * slow + 0.75 * fast)
 
 
 def test_command_is_shortened_to_the_limit_and_keeps_its_direction() -> None:
     states = RNG.normal(size=(5, 4)) * 1000
     free = controlled(filled(states))
-    held = [SetPointLimits(5.0, 9.0).command((north, east)) for north, east in free.command_m_s2.tolist()]
+    held = free.command_m_s2.copy()
+    SetPointLimits(5.0, 9.0).limit_commands(held)
     direction = free.command_m_s2 / np.hypot(*free.command_m_s2.T)[:, None]
     assert np.array(held) == pytest.approx(5.0 * direction)
 

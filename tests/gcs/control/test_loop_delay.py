@@ -2,6 +2,7 @@
 
 from math import inf, isnan, nan
 
+import numpy as np
 import pytest
 
 from gcs.control.loop_delay import Repetitions, headroom, loop_delay_s
@@ -29,10 +30,11 @@ def test_headroom_is_what_is_left_of_the_margin() -> None:
 
 def test_repetitions_count_only_as_far_as_the_telemetry_rate_explains() -> None:
     repetitions = Repetitions(Rates(control_hz=50.0, telemetry_hz=10.0), 2)
-    ages_s = [repetitions.repeated_s([6 * S, 7 * S], 8 * S + k * 20 * MS)[1] for k in range(8)]
+    ages_s = [repetitions.repeated_s(np.array([6 * S, 7 * S]), 8 * S + k * 20 * MS)[1] for k in range(8)]
     assert ages_s == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08, 0.08, 0.08, 0.08])
-    assert repetitions.repeated_s([6 * S, 7 * S + 100 * MS], 9 * S) == [0.08, 0.0]
-    assert Repetitions(Rates(control_hz=50.0, telemetry_hz=50.0), 1).repeated_s([7 * S], 9 * S) == [0.0]
+    assert repetitions.repeated_s(np.array([6 * S, 7 * S + 100 * MS]), 9 * S).tolist() == [0.08, 0.0]
+    always_new = Repetitions(Rates(control_hz=50.0, telemetry_hz=50.0), 1)
+    assert always_new.repeated_s(np.array([7 * S]), 9 * S).tolist() == [0.0]
 
 
 @pytest.mark.parametrize(("up_ms", "down_ms"), [(10, 110), (110, 10), (60, 60)])

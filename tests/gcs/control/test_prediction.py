@@ -95,10 +95,10 @@ def test_the_newest_set_point_acts_an_assumed_delay_after_sampling() -> None:
     history = StateHistory(1)
     history.add(0, START, STATE)
     predicted = states([CommandHistory(LONG)], 0.3)
-    [(acts_ns, assumed_s)] = predicted.look(history, START + 110 * MS)
+    [[acts_ns], [assumed_s]] = predicted.look(history, START + 110 * MS)
     assert (acts_ns, assumed_s) == (START + 300 * MS, pytest.approx(0.3))
     # the next state is lost: its set-point acts a tick later all the same
-    [(acts_ns, assumed_s)] = predicted.look(history, START + 130 * MS)
+    [[acts_ns], [assumed_s]] = predicted.look(history, START + 130 * MS)
     assert (acts_ns, assumed_s) == (START + 320 * MS, pytest.approx(0.3))
 
 
@@ -116,7 +116,7 @@ def test_each_vehicle_is_predicted_from_what_it_was_sent_itself() -> None:
 
 def test_without_a_state_nothing_is_predicted() -> None:
     predicted = states([CommandHistory(LONG)], 0.5)
-    assert predicted.look(StateHistory(1), START) == [(0, 0.0)]
+    assert predicted.look(StateHistory(1), START) == ([0], [0.0])
     assert predicted.at(0, START) is None
 
 
@@ -188,7 +188,7 @@ def test_jitter_of_the_age_does_not_move_when_set_points_act() -> None:
     for tick in range(300):
         due_ns = START + 20 * MS * tick
         history.add(0, due_ns - round(MS * (200.0 + rng.uniform(-9.0, 9.0))), STATE)
-        [(acts_ns, assumed_s)] = predicted.look(history, due_ns)
+        [[acts_ns], [assumed_s]] = predicted.look(history, due_ns)
         assert assumed_s == pytest.approx(0.5)
         assumed_ms.append((acts_ns - due_ns) / MS)
     # a mean of 100 ages, each uniform within 9 ms: a standard deviation of 0.52 ms

@@ -3,6 +3,7 @@
 from collections import Counter
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,8 +28,11 @@ def decode(datagram: bytes) -> tuple[list[mavlink.Frame], Counter[str]]:
 
 
 def test_set_point_is_read_by_pymavlink_as_it_was_meant() -> None:
-    fields = mavlink.acceleration_set_point(key_ms=5, target_system=3, north_m_s2=1.5, east_m_s2=-2.25)
-    data = mavlink.encode(mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, sequence=300)
+    points, sequences = np.zeros(2, mavlink.SET_POINT), np.array([7, 299])
+    points["type_mask"] = mavlink.IGNORE_ALL_BUT_ACCELERATION
+    points["acceleration_ne_m_s2"][1] = 1.5, -2.25
+    [data] = mavlink.set_point_frames(points, np.array([1]), sequences, np.array([2, 3]), 5)
+    assert sequences.tolist() == [7, 300 & 0xFF]
     message = parsed(data)
     assert message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
     assert (message.get_srcSystem(), message.get_srcComponent(), message.get_seq()) == (255, 190, 300 & 0xFF)

@@ -6,20 +6,27 @@ from math import hypot, nan
 import numpy as np
 import pytest
 
-from gcs.control.law import VehicleControl
-from gcs.control.tick import Mode
+from gcs.control.law import CONTROL, Nearest
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.summary import verdict
-from gcs.station.absence import TAKEN_OVER
 from gcs.station.breakage import Breakage, recovery_time_s, slowest_decay_1_s
-from gcs.station.monitor import VehicleState
 from gcs.station.station import Station
+from scenarios.kernel import Records
 from scenarios.schema import Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.flown_copters import TRUTH, Flight, plan_for, three
 from tests.support.fleets.pilots import PILOTS_MODE, PilotsVehicle, flight_s
+
+APART = Nearest(np.full(3, 100.0), (0, 1))
+
+
+def with_errors(*errors_m: float) -> Records:
+    """The controls of vehicles with these spacing errors north."""
+    controls = np.zeros(len(errors_m), CONTROL)
+    controls["spacing_error_m"][:, 0] = errors_m
+    return controls
 
 
 def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:
@@ -47,24 +54,18 @@ def test_vehicles_or_followers_not_back_in_time_end_the_flight() -> None:
     plan = plan_for(three())
     breakage, limit_m = Breakage(plan), plan.scenario.safety.spacing_error_limit_m
 
-    def judged(time_s: float, mode: Mode, errors_m: tuple[float, float]) -> str:
-        """Vehicle 2 in a mode, with the errors of vehicles 2 and 3."""
-        states = [VehicleState(Mode.NOMINAL), VehicleState(mode), VehicleState(Mode.NOMINAL)]
-        controls = [
-            VehicleControl(1, (0.0, 0.0, 0.0, 0.0), (error_m, 0.0), (0.0, 0.0), (0.0, 0.0), 1)
-            for error_m in (nan, *errors_m)
-        ]
-        apart_m = np.full((3, 3), 100.0)
-        return breakage.judge(controls, states, [""] * 3, apart_m, [100.0] * 3, time_s)
+    def judged(time_s: float, errors_m: tuple[float, float], *, away: bool = False) -> str:
+        """With the errors of vehicles 2 and 3, of which vehicle 2 may be away."""
+        return breakage.judge(with_errors(nan, *errors_m), {1: False} if away else {}, APART, time_s)
 
     far_m = 2.0 * limit_m
-    assert judged(1.0, Mode.NOMINAL, (0.9 * limit_m, 0.9 * limit_m)) == ""
-    assert judged(2.0, Mode.FAILSAFE, (far_m, 0.0)) == ""
-    assert judged(3.0, Mode.RECOVERING, (far_m, far_m)) == ""
+    assert judged(1.0, (0.9 * limit_m, 0.9 * limit_m)) == ""
+    assert judged(2.0, (far_m, 0.0), away=True) == ""
+    assert judged(3.0, (far_m, far_m)) == ""
     allowed_s = recovery_time_s(plan, slowest_decay_1_s(plan), far_m, 4.0)
     assert 10.0 < allowed_s < 120.0
-    assert judged(3.0 + 0.99 * allowed_s, Mode.NOMINAL, (far_m, far_m)) == ""
-    reason = judged(3.0 + 1.01 * allowed_s, Mode.NOMINAL, (0.0, far_m))
+    assert judged(3.0 + 0.99 * allowed_s, (far_m, far_m)) == ""
+    reason = judged(3.0 + 1.01 * allowed_s, (0.0, far_m))
     assert reason == f"broken: spacing error of vehicle 3 is {far_m:.0f} m, limit 30 m"
 
 
@@ -73,26 +74,19 @@ def test_a_vehicle_that_keeps_failing_gets_no_new_time() -> None:
     plan = plan_for(three())
     limit_m = plan.scenario.safety.spacing_error_limit_m
 
-    def end_of(error_m: float, again_m: float, why: str = "") -> str:
+    def end_of(error_m: float, again_m: float, *, piloted: bool = False) -> str:
         """The end of a flight in which vehicle 2 falls into its failsafe, or is taken over, every 2 s for 600 s."""
         breakage = Breakage(plan)
         for tick in range(600):
-            away = tick % 2 == 0
-            mode = Mode.FAILSAFE if away and not why else Mode.NOMINAL
-            states = [VehicleState(Mode.NOMINAL), VehicleState(mode), VehicleState(Mode.NOMINAL)]
-            errors_m = (nan, again_m if tick % 4 == 3 else error_m, 0.0)
-            controls = [
-                VehicleControl(1, (0.0, 0.0, 0.0, 0.0), (here_m, 0.0), (0.0, 0.0), (0.0, 0.0), 1) for here_m in errors_m
-            ]
-            absent = ["", why if away else "", ""]
-            reason = breakage.judge(controls, states, absent, np.full((3, 3), 100.0), [100.0] * 3, float(tick))
+            controls = with_errors(nan, again_m if tick % 4 == 3 else error_m, 0.0)
+            reason = breakage.judge(controls, {} if tick % 2 else {1: piloted}, APART, float(tick))
             if reason:
                 return reason
         return ""
 
     assert end_of(2.0 * limit_m, 2.0 * limit_m).startswith("broken: spacing error of vehicle 2")
     assert end_of(2.0 * limit_m, 0.0) == ""
-    assert end_of(2.0 * limit_m, 2.0 * limit_m, why=TAKEN_OVER) == ""
+    assert end_of(2.0 * limit_m, 2.0 * limit_m, piloted=True) == ""
 
 
 def test_the_time_suffices_the_slowest_gains_and_allows_for_limits() -> None:

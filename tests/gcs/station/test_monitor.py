@@ -168,8 +168,8 @@ def update(
     monitor: FormationMonitor, k: int, delays_s: list[float], *, flying: bool = True
 ) -> list[tuple[int, VehicleState, VehicleState]]:
     """Tick k at 50 Hz, with every vehicle heard and guided."""
-    n = len(delays_s)
-    return monitor.update(0.02 * k, [False] * n, [True] * n, [False] * n, delays_s, flying=flying)
+    yes, no = np.ones(len(delays_s), np.bool_), np.zeros(len(delays_s), np.bool_)
+    return monitor.update(0.02 * k, no, yes, no, np.array(delays_s), flying=flying)
 
 
 def test_in_a_tree_a_late_vehicle_changes_only_its_gains() -> None:

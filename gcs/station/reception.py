@@ -1,0 +1,352 @@
+"""Takes datagrams in: what vehicles sent, and what follows from it for their clocks, their states and their start-up.
+
+Nearly all datagrams hold one LOCAL_POSITION_NED, or the reply to a TIMESYNC request. One kernel takes all of these, up
+to the first datagram that is anything else; that one is read frame by frame, by the same kernels where they apply.
+"""
+
+from collections import Counter, defaultdict, deque
+from collections.abc import Sequence
+from itertools import accumulate
+from math import isfinite, nan
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gcs.control.history import StateHistory, add_report
+from gcs.control.tick import CLOCK_JUMPED
+from gcs.link import mavlink
+from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
+from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.mavlink import TIMESYNC, float_at, unsigned_at, usual_message
+from gcs.link.sequence import DUPLICATE, NEW, count
+from gcs.link.vehicle import RemoteVehicle, Report, delivery_ns
+from gcs.station.fleet_kind import FleetKind
+from scenarios.kernel import Array, Records, int64, kernel
+
+AUTOPILOT_COMPONENT = 1
+"""A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
+ANOTHER_ADDRESS = "known system id from another address"
+_NOT_KNOWN = -2
+"""In place of the number of an address that no vehicle sends from."""
+_HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
+REPORTED = np.dtype(
+    [
+        ("boot_ms", "i8"),
+        ("down_m", "f8"),
+        ("velocity_down_m_s", "f8"),
+        ("queue_s", "f8"),  # wait in the socket's buffer
+        ("received_ns", "i8"),  # the operating system's stamp
+        ("bound_s", "f8"),  # the largest error of the instant at which the state was sampled
+    ]
+)
+"""What came with a vehicle's newest state."""
+_ORDER, _REPLY, _JUMP, _EXCHANGE = range(4)
+_NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8"), ("delivery_ns", "i8")])
+"""What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _REPLY: note a round trip
+(value_ns) of a request sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns."""
+_NEWS_OF_A_FRAME = 3
+
+
+class Tables(NamedTuple):
+    """What kernels know of n vehicles, one row for each."""
+
+    links: Records
+    clocks: Records
+    exchanges: Records
+    pending_ns: NDArray[np.int64]
+    counters: Records
+    reports: Records
+    report_counts: NDArray[np.int64]
+    reported: Records
+    telemetry_ns: NDArray[np.int64]
+    """When the newest state came."""
+    frame_ned_m: FloatArray
+    news: Records
+    news_count: NDArray[np.int64]
+    """How many of `news` are new, (1,)."""
+
+
+class Now(NamedTuple):
+    """The time of a step."""
+
+    now_ns: int
+    start_ns: int
+    """When the flight's clock began."""
+    period_ns: int
+    """Least time between two exchanges because of refused states."""
+
+
+def new_reported(n: int) -> Records:
+    """Of REPORTED: nothing has come."""
+    reported = np.zeros(n, REPORTED)
+    for name in ("down_m", "velocity_down_m_s", "queue_s", "bound_s"):
+        reported[name] = nan
+    return reported
+
+
+class Reception:
+    """What the vehicles of a fleet have sent. `report` takes events."""
+
+    def __init__(self, fleet: FleetKind, report: Report, *, start_ns: int, period_ns: int) -> None:
+        self._fleet, self._report = fleet, report
+        self._start_ns, self._period_ns = start_ns, period_ns
+        n = len(fleet.vehicles)
+        self.history = StateHistory(n)
+        self.reported = new_reported(n)
+        self.telemetry_ns = np.zeros(n, np.int64)
+        """When the newest state of each vehicle came."""
+        self.frames: list[tuple[bytes, int]] = []
+        """Frames received since the driver last took them, each with the time at which it was received."""
+        self.counters: Counter[str] = Counter()
+        """Frames that were refused, by reason."""
+        self.touched: set[int] = set()
+        """Vehicles that have sent anything else than positions and replies since `touched` was last cleared."""
+        self._fresh_rtt_s = defaultdict[int, deque[float]](deque)
+        """By row, the round trips that no tick holds yet."""
+        self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
+        self._row_of = np.full(256, -1)
+        for system_id, row in self._row.items():
+            self._row_of[system_id] = row
+        self._news_of(1)
+
+    def _news_of(self, datagrams: int) -> None:
+        """Make room for the news of so many datagrams."""
+        links, history = self._fleet.links, self.history
+        news = np.zeros(max(64, 2 * _NEWS_OF_A_FRAME * datagrams), _NEWS)
+        self._tables = Tables(
+            links.known, *links.clocks, links.counters, history.reports, history.counts, self.reported,
+            self.telemetry_ns, self._fleet.frame_ned_m, news, np.zeros(1, np.int64),
+        )  # fmt: skip
+
+    def fresh_rtt_s(self) -> FloatArray:
+        """For each vehicle the oldest completed round trip that was not returned before; NaN if there is none."""
+        found_s = np.full(len(self._row), nan)
+        for row, fresh_s in [*self._fresh_rtt_s.items()]:
+            found_s[row] = fresh_s.popleft()
+            if not fresh_s:
+                del self._fresh_rtt_s[row]
+        return found_s
+
+    def is_another(self, system_id: int, datagram: Datagram) -> bool:
+        """Whether a frame claims the system id of a vehicle that is known to send from another address."""
+        row = self._row.get(system_id)
+        return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
+
+    def take(self, datagrams: Sequence[Datagram], now_ns: int) -> list[Outgoing]:
+        """Take datagrams in; returns the answers to them."""
+        outgoing: list[Outgoing] = []
+        if not datagrams:
+            return outgoing
+        if _NEWS_OF_A_FRAME * len(datagrams) > len(self._tables.news):
+            self._news_of(len(datagrams))
+        data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True)
+        numbers, known = self._fleet.links.addresses, -1
+        stream, table = np.frombuffer(b"".join(data), np.uint8), np.empty((0, 0), np.int64)
+        now = Now(now_ns, self._start_ns, self._period_ns)
+        place = 0
+        while place < len(datagrams):
+            if len(numbers) != known:  # at first, and when a vehicle has sent from another address
+                known = len(numbers)
+                senders = [numbers.get(address, _NOT_KNOWN) for address in addresses]
+                table = np.array([*accumulate(map(len, data)), *senders, *received_ns, *queued_ns], np.int64)
+            stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, now)
+            self.frames += zip(data[place:stop], received_ns[place:stop], strict=True)
+            self._follow_up(outgoing)
+            if stop < len(datagrams):
+                self._take(datagrams[stop], now, outgoing)
+            place = stop + 1
+        return outgoing
+
+    def _take(self, datagram: Datagram, now: Now, outgoing: list[Outgoing]) -> None:
+        """Take in one datagram, whatever it holds."""
+        if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
+            # once answered in MAVLink 2, the vehicle uses that
+            frames = mavlink.first_heartbeats(datagram.data, self.counters)
+        else:
+            frames = mavlink.decode(datagram.data, self.counters)
+        for frame in frames:
+            row = self._row.get(frame.system_id)
+            if row is None:
+                self.counters["unknown system id"] += 1
+                continue
+            vehicle = self._fleet.vehicles[row]
+            if vehicle.address != datagram.address:
+                if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
+                    self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
+                    continue
+                vehicle.address = datagram.address
+                self._report("vehicle", "found", vehicle.system_id)
+            vehicle.heard_ns = datagram.received_ns
+            vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
+            self.touched.add(row)
+            self.frames.append((frame.data, datagram.received_ns))
+            if frame.component_id != AUTOPILOT_COMPONENT:
+                self.counters["other component"] += 1
+                continue
+            if vehicle.is_replay(frame, datagram.received_ns):
+                continue
+            self._handle(row, vehicle, frame, datagram, now, outgoing)
+
+    def _handle(
+        self,
+        row: int,
+        vehicle: RemoteVehicle,
+        frame: mavlink.Frame,
+        datagram: Datagram,
+        now: Now,
+        outgoing: list[Outgoing],
+    ) -> None:
+        received_ns = datagram.received_ns
+        fields: Any = frame.fields
+        match frame.msg_id:
+            case mavlink.LOCAL_POSITION_NED:
+                boot_ms, *state = fields
+                _take_position(self._tables, row, boot_ms, tuple(state), received_ns, datagram.queued_ns, now)
+                self._follow_up(outgoing)
+            case mavlink.POSITION_TARGET_LOCAL_NED:
+                at_ns = vehicle.clock.station_ns(fields[0], received_ns)
+                if at_ns is not None:
+                    self._fleet.loop.active(row, at_ns, fields)
+            case mavlink.TIMESYNC:
+                tc1_ns, ts1_ns = fields
+                if tc1_ns == 0:
+                    answer = mavlink.timesync(tc1_ns=received_ns, ts1_ns=ts1_ns)
+                    vehicle.send(mavlink.TIMESYNC, answer, outgoing)
+                else:
+                    _take_reply(self._tables, row, tc1_ns, ts1_ns, received_ns, now)
+                    self._follow_up(outgoing)
+            case mavlink.HEARTBEAT:
+                vehicle.heartbeat(fields, received_ns)
+            case mavlink.COMMAND_ACK:
+                vehicle.acknowledge(fields, received_ns)
+            case mavlink.NAMED_VALUE_INT:
+                vehicle.named_int(fields)
+            case mavlink.STATUSTEXT:
+                text = fields[1].split(b"\0")[0].decode(errors="replace")
+                if vehicle.startup.is_news(text):
+                    self._report("statustext", text, vehicle.system_id)
+            case _:
+                pass
+        vehicle.tell_startup(frame.msg_id, fields)
+
+    def _follow_up(self, outgoing: list[Outgoing]) -> None:
+        """Do what the kernels have left to do."""
+        count_ = self._tables.news_count
+        if not count_[0]:
+            return
+        for kind, row, value_ns, sent_ns, delivered_ns in self._tables.news[: count_[0]].tolist():
+            vehicle = self._fleet.vehicles[row]
+            if kind == _ORDER:
+                vehicle.report_order(value_ns)
+            elif kind == _REPLY:
+                self._fresh_rtt_s[row].append(value_ns * 1e-9)
+                self._fleet.loop.delivered(row, max(0, delivered_ns), sent_ns)
+            elif kind == _JUMP:
+                self.touched.add(row)
+                vehicle.begin_anew()
+                self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
+            else:
+                vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=value_ns), outgoing)
+        count_[0] = 0
+
+
+@kernel
+def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int, delivered_ns: int) -> None:
+    news = tables.news[tables.news_count[0]]
+    news.kind, news.row, news.value_ns, news.sent_ns, news.delivery_ns = kind, row, value_ns, sent_ns, delivered_ns
+    tables.news_count[0] += 1
+
+
+@kernel
+def _take_usual(tables: Tables, stream: Array, datagrams: Array, first: int, row_of: Array, now: Now) -> int:
+    """Take in the datagrams from the `first` on; returns the place of one that is not usual, or their number.
+
+    The rows of `datagrams` say of each where it ends in the stream, the number of its sender's address, when it was
+    received and how long it was queued.
+    """
+    ends, senders, received_ns, queued_ns = datagrams[0], datagrams[1], datagrams[2], datagrams[3]
+    for place in range(first, len(ends)):
+        begin, end = ends[place - 1] if place else 0, ends[place]
+        msg_id = usual_message(stream, begin, end)
+        if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
+            return place
+        row = row_of[stream[begin + 5]]
+        if row < 0 or tables.links[row].address != senders[place]:
+            return place
+        payload, payload_end = begin + _HEADER_BYTES, end - _CHECKSUM_BYTES
+        tc1_ns, state = 0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        if msg_id == TIMESYNC:
+            tc1_ns = int64(unsigned_at(stream, payload, 8, payload_end))
+            if tc1_ns == 0:
+                return place  # a request
+        else:
+            state = (
+                float_at(stream, payload + 4, payload_end), float_at(stream, payload + 8, payload_end),
+                float_at(stream, payload + 12, payload_end), float_at(stream, payload + 16, payload_end),
+                float_at(stream, payload + 20, payload_end), float_at(stream, payload + 24, payload_end),
+            )  # fmt: skip
+            if not isfinite(sum(state)):
+                return place
+        link = tables.links[row]
+        link.heard_ns = received_ns[place]
+        link.first_heard_ns = link.first_heard_ns or received_ns[place]
+        order = count(tables.counters[row], int64(stream[begin + 4]), received_ns[place])
+        if order != NEW and not link.told >> order & 1:
+            link.told |= 1 << order
+            _note(tables, _ORDER, row, order, 0, 0)
+        link.newest = order == NEW
+        if order == DUPLICATE:
+            continue
+        if msg_id == TIMESYNC:
+            ts1_ns = int64(unsigned_at(stream, payload + 8, 8, payload_end))
+            _take_reply(tables, row, tc1_ns, ts1_ns, received_ns[place], now)
+        else:
+            boot_ms = int64(unsigned_at(stream, payload, 4, payload_end))
+            _take_position(tables, row, boot_ms, state, received_ns[place], queued_ns[place], now)
+    return len(ends)
+
+
+@kernel
+def _take_position(
+    tables: Tables, row: int, boot_ms: int, state: tuple[float, ...], received_ns: int, queued_ns: int, now: Now
+) -> None:
+    """Take in the fields of a LOCAL_POSITION_NED; `state` is position and velocity, north, east and down."""
+    link, clock = tables.links[row], tables.clocks[row]
+    link.local_ms, link.local_is_new = boot_ms, True
+    for k in range(6):
+        link.local[k] = state[k]
+    sample_ns = sampled_ns(clock, boot_ms, received_ns, link.newest)
+    if link.left_out:
+        return  # on the ground, others may fly over it
+    if sample_ns == UNKNOWN:
+        if not (clock.lost or clock.doubtful_state):
+            tables.telemetry_ns[row] = received_ns  # heard before the first exchange
+        elif now.now_ns - clock.asked_ns >= now.period_ns:
+            _note(tables, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0, 0)
+        return
+    origin = tables.frame_ned_m[row]
+    north, east = state[0] + origin[0], state[1] + origin[1]
+    if not add_report(tables.reports, tables.report_counts, row, sample_ns, north, east, state[3], state[4]):
+        return
+    tables.telemetry_ns[row] = received_ns  # new states only: a replay does not end a silence
+    reported = tables.reported[row]
+    reported.boot_ms, reported.down_m, reported.velocity_down_m_s = boot_ms, state[2] + origin[2], state[5]
+    reported.queue_s, reported.received_ns = queued_ns * 1e-9, received_ns
+    reported.bound_s = bound_at_ns(estimate_of(clock), sample_ns) * 1e-9
+
+
+@kernel
+def _take_reply(tables: Tables, row: int, tc1_ns: int, ts1_ns: int, received_ns: int, now: Now) -> None:
+    """Take in a reply to a TIMESYNC request."""
+    link, clock = tables.links[row], tables.clocks[row]
+    jumps = clock.jumps
+    rtt_ns = reply(clock, tables.exchanges[row], tables.pending_ns[row], tc1_ns, ts1_ns, received_ns)
+    if rtt_ns != UNKNOWN:
+        key_ms = (ts1_ns - now.start_ns) // 1_000_000
+        delivered_ns = delivery_ns(link, clock, key_ms, now.start_ns + key_ms * 1_000_000)
+        _note(tables, _REPLY, row, rtt_ns, ts1_ns, delivered_ns)
+    if clock.jumps != jumps:
+        tables.report_counts[row] = 0
+        _note(tables, _JUMP, row, 0, 0, 0)

@@ -1,0 +1,39 @@
+"""A prepared flight compiles nothing: that would take seconds in which vehicles hear nothing."""
+
+import subprocess
+import sys
+
+import pytest
+
+FLIGHT = """
+import gc, sys
+from gcs.drive.lockstep import fly_lockstep, prepare
+from gcs.plan.planner import flight_plan
+from scenarios.files import load
+from scenarios.keys.link import Link, Links
+from scenarios.schema import Response
+from tests.support.paths import SCENARIOS
+
+def compiled():
+    kernels = [each for each in gc.get_objects() if type(each).__name__ == "_Kernel" and each._compiled is not None]
+    # in real time, the vehicles' run in a process of their own
+    return {each._name: len(each._compiled.signatures) for each in kernels if each._name.startswith("gcs.")}
+
+name, prediction = sys.argv[1:]
+scenario, lossy = load(SCENARIOS / f"{name}.toml"), Link(delay_s=0.05, loss_probability=0.1, duplicate_probability=0.1)
+control = scenario.control.model_copy(update={"prediction": prediction})
+changes = {"control": control, "links": Links(up=lossy, down=lossy), "duration_s": 4.0, "response": None}
+if scenario.dynamics == "autopilot":
+    changes["response"] = Response(lag_s=0.3, velocity_gain_1_s=1.0)
+_, plan = flight_plan(scenario.model_copy(update=changes))
+prepare(plan)
+before = compiled()
+assert len(before) > 10
+assert sum(1 for _ in fly_lockstep(plan)) > 200
+assert compiled() == before, {name: count for name, count in compiled().items() if before.get(name) != count}
+"""
+
+
+@pytest.mark.parametrize(("name", "prediction"), [("triangle5", "off"), ("patrol", "measured"), ("copters5", "off")])
+def test_nothing_is_compiled_in_a_prepared_flight(name: str, prediction: str) -> None:
+    subprocess.run([sys.executable, "-c", FLIGHT, name, prediction], check=True)
