@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Never
 
 if TYPE_CHECKING:
     from scenarios.schema import Scenario
-    from sim_vehicles.drive.fleet import Fleet
+    from sim_vehicles.drive.fleet import Fleet, prepare
     from sim_vehicles.drive.udp import Sockets
     from sim_vehicles.links.truth import TruthLog
     from sim_vehicles.vehicles.shell import Change
@@ -106,6 +106,7 @@ def _fly(
     except OSError as error:
         raise _UsageError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
     opened.callback(ports.sockets.close)
+    prepare(scenario)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
     say = _Lines(start_ns)

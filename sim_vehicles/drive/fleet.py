@@ -10,19 +10,27 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 
+import numpy as np
+
 from scenarios import schema
 from scenarios.files import fingerprint
+from scenarios.kernel import Columns, Records
+from scenarios.schema import NS_PER_S
 from scenarios.signing.link import SignedLink
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
+from sim_vehicles.links.queue import Bytes
 from sim_vehicles.links.truth import Record
 from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.motion.sector import SectorBound
 from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.frames import FRAME_BYTES
+from sim_vehicles.services.hot import Place, new_vehicles
 from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.external import ExternallyFlown
 from sim_vehicles.vehicles.onboard import VehicleLoop
+from sim_vehicles.vehicles.plain import leave_all, next_leaving_ns, run_at, step_all
 from sim_vehicles.vehicles.shell import Change, Radio, Shell
 
 Datagram = tuple[int, bytes, int]
@@ -35,12 +43,11 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
+    row: int
     vehicle: Shell[DoubleIntegrator | Copter | ExternallyFlown]
     up: Link
     down: Link
     signed: SignedLink | None = None
-    leaves_ns: int = NEVER_NS
-    """The earliest instant at which a datagram of this vehicle can leave its up link."""
     acts_ns: int = NEVER_NS
     """When the vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
 
@@ -53,6 +60,10 @@ class Fleet:
     three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle, and a
     disturbance may depend on the errors of all. Then events run in order of time; at one instant the station's
     datagrams first enter their links, then the disturbance acts, then the vehicles by system id.
+
+    One call of a kernel (`vehicles.plain`) lets the station's datagrams enter, runs the usual events of all plain
+    vehicles and collects what leaves. The rest runs in Python, vehicle by vehicle: what is unusual for a plain one, and
+    all events of the others.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
     get only what could be verified.
@@ -72,9 +83,13 @@ class Fleet:
         self._members: dict[int, _Member] = {}
         self._external: ExternallyFlown | None = None
         """The leader, until the flight begins, if somebody else flies it."""
-        self._heap: list[tuple[int, int]] = []
-        """(leaves_ns, system id); an entry that its member contradicts is stale and skipped."""
         self._links = LinkSet(scenario, start_ns, record=record)
+        count = len(scenario.vehicles)
+        self._vehicles = new_vehicles(count)
+        self._columns = Columns(self._vehicles)
+        self._waiting = np.zeros((count, 2), np.int64)
+        most = max(64, 2 * count)  # datagrams that leave at one time; of more, the kernel returns a part
+        self._leaving, self._leaving_data = np.zeros((most, 4), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
         self._acts: list[tuple[int, int]] = []
         """(acts_ns, system id), if events run in order of time; stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
@@ -85,8 +100,8 @@ class Fleet:
         disturbance = scenario.disturbance
         self._sector = None if disturbance is None or disturbance.sector is None else SectorBound(scenario)
         self._in_order = sensors or self._links.have_channels or self._sector is not None
-        for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
-            radio = Radio(scenario, own, start_ns, record)
+        for row, own in enumerate(sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id)):
+            radio = Radio(scenario, own, start_ns, record, Place(self._vehicles, self._columns, row))
             craft: DoubleIntegrator | Copter | ExternallyFlown
             if scenario.dynamics == "autopilot":
                 craft = Copter(scenario, own, radio)
@@ -96,10 +111,11 @@ class Fleet:
             if own.system_id == scenario.external_id:
                 craft = self._external = ExternallyFlown(scenario, craft, scenario.altitude_of(own))
             vehicle = Shell(scenario, radio, craft, signed=bool(signed), experiment=experiment)
-            self._members[own.system_id] = _Member(
-                vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
-            )
-        for member in self._members.values():
+            up, down = self._links.of(own.system_id)
+            self._members[own.system_id] = _Member(row, vehicle, up, down, signed[own.system_id] if signed else None)
+            self._columns["plain"][row] = craft.is_plain and up.plain and not signed and not self._in_order
+        self._in_rows = list(self._members.values())
+        for member in self._in_rows:
             self._plan(member)
         if self._sector is not None:
             heapq.heappush(self._acts, (start_ns, _SECTOR))
@@ -111,15 +127,12 @@ class Fleet:
     @property
     def next_event_ns(self) -> int:
         """Until this instant in ns, `step` returns nothing unless datagrams arrive."""
-        heap = self._heap
-        while heap and self._members[heap[0][1]].leaves_ns != heap[0][0]:
-            heapq.heappop(heap)
-        return heap[0][0] if heap else NEVER_NS
+        return next_leaving_ns(*self._arrays()[:2])
 
     @property
     def commanded_ns(self) -> int:
         """When a station last commanded a vehicle; the start if never."""
-        return max(self._start_ns, *(member.vehicle.authority.commanded_ns for member in self._members.values()))
+        return max(self._start_ns, int(self._vehicles["commanded_ns"].max()))
 
     @property
     def shut_down_ns(self) -> int:
@@ -166,26 +179,50 @@ class Fleet:
                 self._begin(data, time_ns)
         if self._in_order:
             self._run_in_order(received, now_ns)
-        else:
-            for system_id, data, time_ns in received:
-                member = self._members[system_id]
-                member.down.send(data, time_ns)
-                if member.down.next_due_ns + member.up.least_delay_ns < member.leaves_ns:
-                    self._plan(member)
+            received = ()
+        entering = list(received)
+        numbers = [number for system_id, data, time_ns in entering for number in (system_id, len(data), time_ns)]
+        data = np.frombuffer(b"".join([data for _, data, _ in entering]), np.uint8)
+        edge = data, np.array(numbers, np.int64), self._waiting, self._leaving, self._leaving_data
+        entered, waiting, leaving = step_all(*self._arrays(), *edge, 0, now_ns)
+        while entered < len(entering):
+            system_id, datagram, time_ns = entering[entered]
+            self._members[system_id].down.send(datagram, time_ns)
+            entered, waiting, leaving = step_all(*self._arrays(), *edge, entered + 1, now_ns)
         out: list[Datagram] = []
-        heap = self._heap
-        while heap and heap[0][0] <= now_ns:
-            leaves_ns, system_id = heapq.heappop(heap)
-            member = self._members[system_id]
-            if leaves_ns != member.leaves_ns:
-                continue
+        if waiting:
+            out = self._run_waiting(waiting, now_ns)
+            leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
+        while leaving:
+            rows: list[list[int]] = self._leaving[:leaving].tolist()
+            left = self._leaving_data[: rows[-1][2]].tobytes()
+            out += [(system_id, left[begin:end], due_ns) for system_id, begin, end, due_ns in rows]
+            if leaving < len(self._leaving):
+                break
+            leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
+        out.sort(key=_DUE_THEN_SYSTEM_ID)
+        return out
+
+    def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records]:
+        """What the kernels work on."""
+        queues = self._links.queues
+        return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws
+
+    def _run_waiting(self, count: int, now_ns: int) -> list[Datagram]:
+        """Bring the vehicles up to date that the kernel has left; returns what leaves if that is recorded."""
+        out: list[Datagram] = []
+        for _, row in sorted(self._waiting[:count].tolist()):
+            member = self._in_rows[row]
+            if self._columns["plain"][row]:
+                member.up.make_ready()
+                if run_at(*self._arrays(), row, now_ns):
+                    continue
             self._catch_up(member, now_ns)
-            for entry in member.up.due(now_ns):
-                out.append((system_id, entry[3], entry[0]))
-                if self._record is not None:
+            if self._record is not None:
+                for entry in member.up.due(now_ns):
+                    out.append((member.vehicle.system_id, entry[3], entry[0]))
                     self._record(member.up.row(entry, now_ns))
             self._plan(member)
-        out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
 
     def _begin(self, data: bytes, time_ns: int) -> None:
@@ -261,13 +298,14 @@ class Fleet:
             member.up.send(data if member.signed is None else member.signed.sign(data, time_ns), time_ns)
 
     def _plan(self, member: _Member) -> None:
-        """Note when a datagram of the vehicle can leave next. Comparisons, not min(): this runs for every datagram."""
-        acts_ns, arrives_ns = member.vehicle.next_event_ns, member.down.next_due_ns
-        leaves_ns = (arrives_ns if arrives_ns < acts_ns else acts_ns) + member.up.least_delay_ns
-        leaves_ns = min(leaves_ns, member.up.next_due_ns)
-        if leaves_ns != member.leaves_ns:
-            member.leaves_ns = leaves_ns
-            heapq.heappush(self._heap, (leaves_ns, member.vehicle.system_id))
-        if self._in_order and member.acts_ns != min(acts_ns, arrives_ns):
-            member.acts_ns = min(acts_ns, arrives_ns)
+        """Note when the vehicle next acts."""
+        acts_ns = member.vehicle.next_event_ns
+        self._columns["acts_ns"][member.row] = acts_ns
+        if self._in_order and member.acts_ns != min(acts_ns, member.down.next_due_ns):
+            member.acts_ns = min(acts_ns, member.down.next_due_ns)
             heapq.heappush(self._acts, (member.acts_ns, member.vehicle.system_id))
+
+
+def prepare(scenario: schema.Scenario) -> None:
+    """Run plain vehicles of a scenario for a second, so that nothing of them needs to be compiled in real time."""
+    Fleet(scenario.model_copy(update={"dynamics": "double_integrator"}), 0).step((), NS_PER_S)

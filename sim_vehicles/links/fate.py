@@ -1,4 +1,4 @@
-"""What happens to one datagram on a link: a pure function of the link, the time and the random draws.
+"""What decides what happens to a datagram on a link: the link, the time and random draws.
 
 A link's schema is converted once into a frozen `LinkBehaviour`, with all times in ns. Each link has two random streams:
 one decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from
@@ -6,44 +6,31 @@ both, used or not. So more loss leaves the delays unchanged, and one link's traf
 """
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from scenarios.kernel import Record, Records, kernel
 from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
-from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
 
 MOST_FLIPS = 4
-_BLOCK = 128
+BLOCK = 128
 """Datagrams whose draws are made together: numpy takes as long for one as for a hundred."""
 
 
-class Draws(NamedTuple):
-    """All that is random about one datagram: uniform in [0, 1), except the jitter."""
-
-    burst: float
-    loss: float
-    duplicate: float
-    corrupt: float
-    flips: tuple[float, ...]
-    """Where bits are flipped, as fractions of the datagram's length; `corrupt` also says how many are used."""
-    jitter_ns: int
-    duplicate_jitter_ns: int
-
-
-class Fate(NamedTuple):
-    """What happens to a datagram."""
-
-    fate: int
-    bad: bool
-    """Whether the next datagram finds the link in its bad state."""
-    delay_ns: int
-    duplicate_delay_ns: int
-    """-1 if there is no second copy."""
-    flips: tuple[float, ...]
+DRAW = np.dtype(
+    [
+        ("burst", "f8"), ("loss", "f8"), ("duplicate", "f8"), ("corrupt", "f8"),
+        ("flips", "f8", (MOST_FLIPS,)),  # where bits are flipped; `corrupt` also says how many are used
+        ("jitter_ns", "i8"), ("duplicate_jitter_ns", "i8"),
+    ]
+)  # fmt: skip
+"""All that is random about one datagram: uniform in [0, 1), except the jitter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,27 +80,9 @@ def constant(link: link_keys.Link) -> bool:
     return link == plain and link.channel is None
 
 
-def outcome(link: LinkBehaviour, *, bad: bool, time_ns: int, draws: Draws) -> Fate:
-    """The fate of a datagram that enters at link time `time_ns`, with the link's state `bad` since the last datagram.
-
-    A channel or a full link may still drop it.
-    """
-    bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
-    fate = PASSED
-    for from_ns, until_ns in link.outages_ns:
-        if from_ns <= time_ns < until_ns:
-            fate |= OUTAGE
-    if draws.loss < (link.loss_bad if bad else link.loss_good):
-        fate |= LOST
-    flips: tuple[float, ...] = ()
-    if draws.corrupt < link.corrupt:
-        fate |= CORRUPTED
-        # Given that it is below its bound, the draw is uniform again: it also picks the number of flips.
-        flips = draws.flips[: 1 + int(MOST_FLIPS * draws.corrupt / link.corrupt)]
-    delay_ns = delay_at(link, time_ns)
-    twice = draws.duplicate < link.duplicate
-    duplicate_ns = max(0, delay_ns + draws.duplicate_jitter_ns) if twice else -1
-    return Fate(fate, bad, max(0, delay_ns + draws.jitter_ns), duplicate_ns, flips)
+def in_outage(link: LinkBehaviour, time_ns: int) -> bool:
+    """Whether everything is lost that enters at a link time."""
+    return any(from_ns <= time_ns < until_ns for from_ns, until_ns in link.outages_ns)
 
 
 def delay_at(link: LinkBehaviour, time_ns: int) -> int:
@@ -128,39 +97,55 @@ def delay_at(link: LinkBehaviour, time_ns: int) -> int:
     return before_ns + (then_ns - before_ns) * (time_ns - begin_ns) // (end_ns - begin_ns)
 
 
-def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
-    """The datagram with bits flipped at these fractions of its length; a place named twice flips once."""
-    changed = bytearray(data)
-    for place in {int(part * len(data) * 8) for part in flips} if data else ():
-        changed[place // 8] ^= 1 << place % 8
-    return bytes(changed)
+@kernel
+def drawn_bad(link: Record, draw: Record) -> bool:
+    """Whether a datagram finds a link in its bad state, from how the last one found it."""
+    return draw.burst >= link.to_good if link.bad else draw.burst < link.to_bad
+
+
+@kernel
+def flips_of(probability: float, drawn: float) -> int:
+    """How many bits of a corrupted datagram are flipped, those at one place counted twice.
+
+    Given that the draw is below the probability, it is uniform again.
+    """
+    return min(MOST_FLIPS, 1 + int(MOST_FLIPS * drawn / probability))
+
+
+@kernel
+def flip(data: NDArray[np.uint8], size: int, flips: NDArray[np.float64], count: int) -> None:
+    """Flip bits at fractions of a datagram's length; a place named twice flips once."""
+    for k in range(count if size else 0):
+        place = int(flips[k] * size * 8)
+        first = True
+        for other in range(k):
+            first = first and int(flips[other] * size * 8) != place
+        if first:
+            data[place // 8] ^= 1 << place % 8
 
 
 class _Delays(Protocol):
     """Draws the jitter of a number of datagrams and of their duplicates, in s."""
 
-    def __call__(self, count: int) -> list[tuple[float, float]]: ...
+    def __call__(self, count: int) -> Sequence[tuple[float, float]] | NDArray[np.float64]: ...
 
 
 class Stream:
-    """The draws of one link, datagram by datagram."""
+    """The draws of one link, a block at a time."""
 
     def __init__(self, link: link_keys.Link, seeds: np.random.SeedSequence) -> None:
         fates, delays = seeds.spawn(2)
         self._fates = np.random.default_rng(fates)
         self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
-        self._block: list[Draws] = []
 
-    def next(self) -> Draws:
-        if not self._block:
-            uniform: list[list[float]] = self._fates.random((_BLOCK, 4 + MOST_FLIPS)).tolist()
-            delays = self._delays(_BLOCK)
-            self._block = [
-                Draws(burst, loss, duplicate, corrupt, tuple(flips), _ns(first_s), _ns(second_s))
-                for (burst, loss, duplicate, corrupt, *flips), (first_s, second_s) in zip(uniform, delays, strict=True)
-            ]
-            self._block.reverse()
-        return self._block.pop()
+    def fill(self, block: Records) -> None:
+        """Fill a block of `DRAW` with the next draws."""
+        uniform = self._fates.random((BLOCK, 4 + MOST_FLIPS))
+        for k, name in enumerate(("burst", "loss", "duplicate", "corrupt")):
+            block[name] = uniform[:, k]
+        block["flips"] = uniform[:, 4:]
+        delays_ns = np.rint(np.array(self._delays(BLOCK)) * NS_PER_S)
+        block["jitter_ns"], block["duplicate_jitter_ns"] = delays_ns.T
 
 
 def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _Delays:
@@ -168,7 +153,7 @@ def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _De
         return lambda count: [(0.0, 0.0)] * count
     if jitter.distribution == "trace":
         return _in_trace_order(jitter.trace_s or (0.0,), rng)
-    return lambda count: [(first, second) for first, second in jitter.drawn_s((count, 2), rng).tolist()]
+    return lambda count: jitter.drawn_s((count, 2), rng)
 
 
 def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:

@@ -1,25 +1,32 @@
 """An emulated one-way radio link: a queue ordered by the time each datagram comes out.
 
-A datagram's fate is decided once, when it enters (`Link.send`): `fate` says what happens to it, `Channel` how long it
-waits for bandwidth. A link that only delays by a constant draws no random numbers.
+A datagram's fate is decided once, when it enters (`Link.send`): `fate` draws what happens to it, `queue` makes it
+happen, and `Channel` says how long it waits for bandwidth. A link that only delays by a constant draws no random
+numbers.
 """
 
-import heapq
 from collections import Counter, deque
 
+import numpy as np
+
 from scenarios import schema
+from scenarios.kernel import Cell, kernel
 from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links import truth
-from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
-from sim_vehicles.links.truth import DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
+from sim_vehicles.links.fate import BLOCK, Stream, behaviour_of, constant, delay_at, flip, flips_of, in_outage
+from sim_vehicles.links.queue import NOT_READY, Queues, enter_at, has_room, new_queues, take_due_at
+from sim_vehicles.links.truth import DROPPED, DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.draws import Use, seeds_of
+from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.mavlink import message_id
 
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
+MOST_ID = 250
+"""The largest system id of a vehicle."""
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
 
@@ -70,11 +77,22 @@ class Channel:
 
 
 class Link:
-    """Datagrams under way in one direction.
+    """Datagrams under way in one direction: a row of `Queues`.
 
     `counts` says by name what happened to them: `duplicated`, `corrupted`, and why they were dropped. Datagrams that
     entered, plus duplicates, equal those that came out, were dropped, or are under way.
     """
+
+    next_due_ns = Cell[int]()
+    entered = Cell[int]()
+    least_delay_ns = Cell[int]()
+    """No datagram takes less time than this."""
+    under_way = Cell[int]()
+    """How many datagrams have neither come out nor been dropped."""
+    plain = Cell[bool]()
+    """Whether kernels alone can run it: no channel limits it, it is the same at all times, and nothing is recorded."""
+    _drawn = Cell[int]()
+    _barred = Cell[int]()
 
     def __init__(
         self,
@@ -86,31 +104,45 @@ class Link:
         kind: int = LINK_UP,
         channel: Channel | None = None,
         record: Record | None = None,
+        queues: Queues | None = None,
+        row: int = 0,
     ) -> None:
         self.kind = kind
         self.system_id = system_id
-        self.next_due_ns = NEVER_NS
-        self.entered = 0
-        self.counts: Counter[str] = Counter()
         self.zero_ns = NEVER_NS
         """Host time at which the link's own time is 0."""
-        self.behaviour = behaviour_of(link)
-        self.least_delay_ns = self.behaviour.least_delay_ns
-        """No datagram takes less time than this."""
+        self._behaviour = behaviour_of(link)
         self._capacity = capacity
         self._channel = channel
-        self._record = record
-        self._queue: list[Entry] = []
-        self._last_due_ns = 0
-        self._bad = False
+        self._truth = record
+        self._queues, self._row = new_queues(1) if queues is None else queues, row
+        self._columns = self._queues.columns
+        self._long: dict[tuple[int, int], bytes] = {}
+        """Datagrams that are longer than a frame, by (number, whether it is the DUPLICATE)."""
         self._stream = None
         if channel is not None or not constant(link):
             self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
+        own = self._behaviour
+        self._delay_ns = own.points_ns[0][1]
+        values = {"capacity": capacity, "random": self._stream is not None, "delay_ns": self._delay_ns}
+        values["plain"] = channel is None and not own.timed and record is None
+        for name in (
+            "least_delay_ns",
+            "reordering",
+            "to_bad",
+            "to_good",
+            "loss_good",
+            "loss_bad",
+            "duplicate",
+            "corrupt",
+        ):
+            values[name] = getattr(own, name)
+        for name, value in values.items():
+            self._columns[name][row] = value
 
     @property
-    def under_way(self) -> int:
-        """How many datagrams have neither come out nor been dropped."""
-        return len(self._queue)
+    def counts(self) -> Counter[str]:
+        return Counter({name: count for name in FATES.values() if (count := self._columns[name][self._row])})
 
     @property
     def dropped(self) -> int:
@@ -119,22 +151,41 @@ class Link:
 
     def send(self, data: bytes, time_ns: int) -> None:
         """Take in a datagram that enters the link at `time_ns`."""
-        self.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
-        if self._stream is not None:
-            self._send_drawn(data, time_ns, self._stream)
-        elif len(self._queue) >= self._capacity:
-            self._drop(data, time_ns, LINK_FULL)
-        else:
-            heapq.heappush(self._queue, (time_ns + self.least_delay_ns, self.entered, time_ns, data, PASSED, 0))
-            self.next_due_ns = self._queue[0][0]
+        begin_ns = end_ns = time_ns
+        delay_ns = self._delay_ns
+        if self._channel is not None or self._behaviour.timed:
+            link_time_ns = time_ns - self.zero_ns
+            delay_ns, self._barred = delay_at(self._behaviour, link_time_ns), PASSED
+            if in_outage(self._behaviour, link_time_ns):
+                self._barred = truth.OUTAGE
+            elif self._channel is not None and self.under_way < self._capacity:
+                sending_ns = self._channel.send(len(data), time_ns)
+                begin_ns, end_ns = sending_ns or (time_ns, time_ns)
+                self._barred = PASSED if sending_ns else truth.QUEUE_FULL
+        entering = np.frombuffer(data, np.uint8), time_ns, begin_ns, end_ns, delay_ns
+        queues, fate = self._queues, NOT_READY
+        while fate == NOT_READY:
+            fate = enter_at(queues.links, queues.entries, queues.frames, queues.draws, self._row, *entering)
+            if fate == NOT_READY:
+                self.make_ready()
+        if len(data) > FRAME_BYTES:
+            self._keep(data, fate)
+        if self._truth is not None and fate & DROPPED:
+            fate &= DUPLICATE | DROPPED
+            row = (self.kind, self.system_id, message_id(data), time_ns, time_ns, time_ns, fate, begin_ns - time_ns)
+            self._truth(row)
 
     def due(self, now_ns: int) -> list[Entry]:
         """The datagrams that have come out by now, in order."""
         out: list[Entry] = []
-        queue = self._queue
-        while queue and queue[0][0] <= now_ns:
-            out.append(heapq.heappop(queue))
-        self.next_due_ns = queue[0][0] if queue else NEVER_NS
+        queues = self._queues
+        while self.next_due_ns <= now_ns and (entry := take_due_at(queues.links, queues.entries, self._row, now_ns)):
+            due_ns, number, entered_ns, fate, queued_ns, size, _, _ = queues.entries[entry].item()
+            if size <= FRAME_BYTES:
+                data = queues.frames[entry, :size].tobytes()
+            else:
+                data = self._long.pop((number, fate & DUPLICATE))
+            out.append((due_ns, number, entered_ns, data, fate, queued_ns))
         return out
 
     def row(self, entry: Entry, time_ns: int) -> Row:
@@ -142,44 +193,31 @@ class Link:
         due_ns, _, entered_ns, data, fate, queued_ns = entry
         return self.kind, self.system_id, message_id(data), time_ns, entered_ns, due_ns, fate, queued_ns
 
-    def _send_drawn(self, data: bytes, time_ns: int, stream: Stream) -> None:
-        found = outcome(self.behaviour, bad=self._bad, time_ns=time_ns - self.zero_ns, draws=stream.next())
-        self._bad = found.bad
-        begin_ns = end_ns = time_ns
-        if found.fate & truth.OUTAGE:
-            return self._drop(data, time_ns, truth.OUTAGE)
-        if len(self._queue) >= self._capacity:
-            return self._drop(data, time_ns, LINK_FULL)
-        if self._channel is not None:
-            sending_ns = self._channel.send(len(data), time_ns)
-            if sending_ns is None:
-                return self._drop(data, time_ns, truth.QUEUE_FULL)
-            begin_ns, end_ns = sending_ns
-        if found.fate & truth.LOST:
-            return self._drop(data, time_ns, truth.LOST, begin_ns - time_ns)
-        if found.fate & truth.CORRUPTED:
-            self.counts[FATES[truth.CORRUPTED]] += 1
-            data = flipped(data, found.flips)
-        self._push(end_ns + found.delay_ns, time_ns, data, found.fate, begin_ns - time_ns)
-        if found.duplicate_delay_ns >= 0:
-            self.counts[FATES[DUPLICATE]] += 1
-            if len(self._queue) >= self._capacity:
-                return self._drop(data, time_ns, DUPLICATE | LINK_FULL)
-            due_ns = end_ns + found.duplicate_delay_ns
-            self._push(due_ns, time_ns, data, found.fate | DUPLICATE, begin_ns - time_ns)
-        return None
+    def make_ready(self) -> None:
+        """See to it that a datagram can enter: that there are draws, and room in the pool for it and a duplicate."""
+        if self._stream is not None and self._drawn == BLOCK:
+            self._stream.fill(self._queues.draws[self._row])
+            self._drawn = 0
+        if not has_room(self._queues.entries):
+            self._queues.grow()
 
-    def _push(self, due_ns: int, entered_ns: int, data: bytes, fate: int, queued_ns: int) -> None:
-        if not self.behaviour.reordering:
-            self._last_due_ns = due_ns = max(due_ns, self._last_due_ns)
-        heapq.heappush(self._queue, (due_ns, self.entered, entered_ns, data, fate, queued_ns))
-        self.next_due_ns = self._queue[0][0]
+    def _keep(self, data: bytes, fate: int) -> None:
+        """Keep a datagram that is longer than a frame, with the fate that it had."""
+        if fate & DROPPED and not fate & DUPLICATE:
+            return
+        if fate & truth.CORRUPTED:
+            draw, changed = self._queues.draws[self._row, self._drawn - 1], np.frombuffer(bytearray(data), np.uint8)
+            flip(changed, len(data), draw["flips"], flips_of(self._behaviour.corrupt, float(draw["corrupt"])))
+            data = changed.tobytes()
+        self._long[self.entered, 0] = data
+        if fate & DUPLICATE and not fate & DROPPED:
+            self._long[self.entered, DUPLICATE] = data
 
-    def _drop(self, data: bytes, time_ns: int, fate: int, queued_ns: int = 0) -> None:
-        self.counts[FATES[fate & ~DUPLICATE]] += 1
-        if self._record is not None:
-            row = (self.kind, self.system_id, message_id(data), time_ns, time_ns, time_ns, fate, queued_ns)
-            self._record(row)
+
+@kernel
+def row_of(system_id: int, kind: int) -> int:
+    """Where the link of a vehicle is among the queues of a `LinkSet`."""
+    return 2 * system_id + (kind == LINK_DOWN)
 
 
 class LinkSet:
@@ -192,6 +230,8 @@ class LinkSet:
         self._channels: dict[tuple[str, int, int], Channel] = {}
         self._known = {channel.name: channel for channel in scenario.links.channels}
         self._pairs: dict[int, tuple[Link, Link]] = {}
+        self.queues = new_queues(2 * (MOST_ID + 1))
+        """Of all links, in the rows of `row_of`."""
         self.zero_ns = start_ns if scenario.links.times_from == "start" else NEVER_NS
         """Host time at which the links' time is 0; NEVER_NS before the flight has begun."""
 
@@ -227,7 +267,7 @@ class LinkSet:
     def _made(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
-            record=self._record,
+            record=self._record, queues=self.queues, row=row_of(system_id, kind),
         )  # fmt: skip
         made.zero_ns = self.zero_ns
         return made

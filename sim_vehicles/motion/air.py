@@ -10,7 +10,7 @@ from the start of the vehicles, so common gusts push all of them at once.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeVar
 
 from scenarios.keys import disturbance
@@ -37,6 +37,8 @@ class Push(NamedTuple):
 
 
 STILL = Push()
+Piece = tuple[float, float, float, float, float]
+"""An interval in s; half the change of velocity in it, north and east; and how far the vehicle is carried in it."""
 
 
 class Gusts:
@@ -93,8 +95,17 @@ class Air:
     ) -> Moved:
         """The motion at a later instant; `move` is the vehicle's own motion over a duration in s.
 
-        `shift` adds changes of position (north, east) and velocity to a motion. `foreseen`: a look ahead over
-        an interval that will be computed again, so nothing is recorded or forgotten.
+        `shift` adds changes of position (north, east) and velocity to a motion.
+        """
+        for t, half_north, half_east, north, east in self.pieces(from_ns, to_ns, foreseen=foreseen):
+            motion = shift(motion, 0.0, 0.0, half_north, half_east)
+            motion = shift(move(motion, t), north, east, half_north, half_east)
+        return motion
+
+    def pieces(self, from_ns: int, to_ns: int, *, foreseen: bool = False) -> Iterator[Piece]:
+        """The intervals of constant push, in order. They must be used up at once.
+
+        `foreseen`: a look ahead over an interval that will be computed again, so nothing is recorded or forgotten.
         """
         while from_ns < to_ns:
             push, until_ns = self._at(from_ns)
@@ -102,11 +113,8 @@ class Air:
                 self._note(push, from_ns)
             until_ns = min(until_ns, to_ns)
             t = (until_ns - from_ns) / NS_PER_S
-            half_north, half_east = 0.5 * t * push[0], 0.5 * t * push[1]
-            motion = shift(motion, 0.0, 0.0, half_north, half_east)
-            motion = shift(move(motion, t), t * push[2], t * push[3], half_north, half_east)
+            yield t, 0.5 * t * push[0], 0.5 * t * push[1], t * push[2], t * push[3]
             from_ns = until_ns
-        return motion
 
     def _at(self, time_ns: int) -> tuple[Push, int]:
         """What pushes the vehicle from an instant on, and until when."""

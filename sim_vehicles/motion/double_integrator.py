@@ -7,13 +7,16 @@ u is the commanded acceleration (north, east). While u is constant and no limit 
 of a planar double integrator. Otherwise RK4 integrates the equations with M evaluated in every stage: the linearisation
 is continuous, not sampled.
 
-The functions take scalars because they run for every sample and every set-point of every vehicle.
+The motion runs in kernels, for every sample and every set-point of every vehicle.
 """
 
 import math
 from typing import NamedTuple
 
 from scenarios import schema
+from scenarios.hypot import hypot
+from scenarios.kernel import Record, kernel
+from scenarios.schema import NS_PER_S
 
 LONGEST_STEP_S = 0.02
 VELOCITY_GAIN_1_S = 2.0
@@ -70,10 +73,11 @@ def bounds_of(limits: schema.Limits) -> Bounds:
 
 def state_from(position_ne_m: tuple[float, float], velocity_ne_m_s: tuple[float, float]) -> State:
     """The state of a vehicle at a position with a velocity over ground."""
-    north, east = velocity_ne_m_s
-    return State(*position_ne_m, math.atan2(east, north), math.hypot(north, east))
+    (place_north, place_east), (north, east) = position_ne_m, velocity_ne_m_s
+    return State(float(place_north), float(place_east), math.atan2(east, north), math.hypot(north, east))
 
 
+@kernel
 def advance(state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
     """The state after `duration_s` with the command held."""
     if _is_free(state[3], command, bounds, duration_s):
@@ -88,20 +92,85 @@ def advance(state: State, command: Command, bounds: Bounds, duration_s: float) -
     return state
 
 
+@kernel
+def advance_to(vehicle: Record, time_ns: int) -> None:
+    """Move a vehicle to a time; it stays where it is until it flies. An earlier time changes nothing."""
+    if time_ns <= vehicle.state_ns:
+        return
+    if vehicle.flying:
+        duration_s = (time_ns - vehicle.state_ns) / NS_PER_S
+        set_state(vehicle, advance(state_of(vehicle), command_of(vehicle), _bounds_of(vehicle), duration_s))
+    vehicle.state_ns = time_ns
+
+
+@kernel
+def state_of(vehicle: Record) -> State:
+    return State(vehicle.north_m, vehicle.east_m, vehicle.yaw_rad, vehicle.speed_m_s)
+
+
+@kernel
+def set_state(vehicle: Record, state: State) -> None:
+    vehicle.north_m, vehicle.east_m, vehicle.yaw_rad, vehicle.speed_m_s = state
+
+
+@kernel
+def command_of(vehicle: Record) -> Command:
+    return Command(
+        vehicle.acceleration_north_m_s2,
+        vehicle.acceleration_east_m_s2,
+        vehicle.velocity_north_m_s,
+        vehicle.velocity_east_m_s,
+        vehicle.velocity_gain_1_s,
+    )
+
+
+@kernel
+def set_command(vehicle: Record, command: Command) -> None:
+    vehicle.acceleration_north_m_s2, vehicle.acceleration_east_m_s2 = command[0], command[1]
+    vehicle.velocity_north_m_s, vehicle.velocity_east_m_s, vehicle.velocity_gain_1_s = (
+        command[2],
+        command[3],
+        command[4],
+    )
+
+
+@kernel
+def _bounds_of(vehicle: Record) -> Bounds:
+    return Bounds(
+        vehicle.speed_min_m_s, vehicle.speed_max_m_s, vehicle.acceleration_max_m_s2, vehicle.turn_rate_max_rad_s
+    )
+
+
+@kernel
 def shifted(state: State, north_m: float, east_m: float, north_m_s: float, east_m_s: float) -> State:
     """The state with these changes of position and velocity; the course turns by less than half a circle."""
     cosine, sine = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
     along, across = state.speed_m_s + cosine * north_m_s + sine * east_m_s, cosine * east_m_s - sine * north_m_s
-    turn_rad, speed_m_s = math.atan2(across, along), math.hypot(along, across)
+    turn_rad, speed_m_s = math.atan2(across, along), hypot(along, across)
     return State(state.north_m + north_m, state.east_m + east_m, state.yaw_rad + turn_rad, speed_m_s)
 
 
+@kernel
+def pushed(state: State, command: Command, bounds: Bounds, piece: tuple[float, float, float, float, float]) -> State:
+    """The state after an interval of constant push, a `Piece` of `air`, with the command held."""
+    t, half_north, half_east, north, east = piece
+    state = shifted(state, 0.0, 0.0, half_north, half_east)
+    return shifted(advance(state, command, bounds, t), north, east, half_north, half_east)
+
+
+@kernel
+def push_on(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
+    """Move a flying vehicle by an interval of constant push."""
+    set_state(vehicle, pushed(state_of(vehicle), command_of(vehicle), _bounds_of(vehicle), piece))
+
+
+@kernel
 def _is_free(speed: float, command: Command, bounds: Bounds, t: float) -> bool:
     """Whether u is constant and no limit can bind within t seconds."""
     if command[4] != 0.0:
         return False
     speed_min, speed_max, acceleration_max, turn_rate_max = bounds
-    wanted = math.hypot(command[0], command[1])
+    wanted = hypot(command[0], command[1])
     slowest = speed - wanted * t
     return (
         slowest > speed_min
@@ -111,6 +180,7 @@ def _is_free(speed: float, command: Command, bounds: Bounds, t: float) -> bool:
     )
 
 
+@kernel
 def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State:
     """The solution without limits: the velocity changes by u t, resolved along and across the initial course.
 
@@ -124,7 +194,7 @@ def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State
         north + t * (speed * cosine + half * u_north),
         east + t * (speed * sine + half * u_east),
         yaw + math.atan2(across, along),
-        math.hypot(along, across),
+        hypot(along, across),
     )
 
 
@@ -137,6 +207,7 @@ def limited(state: State, command: Command, bounds: Bounds) -> tuple[float, floa
     return command[:2] if math.dist(found, command[:2]) <= 1e-9 * (1.0 + math.hypot(*found)) else found
 
 
+@kernel
 def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> State:
     """A Runge-Kutta step with all limits."""
     north, east, yaw, speed = state
@@ -160,6 +231,7 @@ def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> S
     )
 
 
+@kernel
 def rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[float, float, float, float]:
     """Rates of (north, east, yaw, speed).
 
@@ -174,7 +246,7 @@ def rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[f
         u_north += gain * (velocity_north - rate_north)
         u_east += gain * (velocity_east - rate_east)
     if u_north * u_north + u_east * u_east > acceleration_max * acceleration_max:
-        shorten = acceleration_max / math.hypot(u_north, u_east)
+        shorten = acceleration_max / hypot(u_north, u_east)
         u_north *= shorten
         u_east *= shorten
     acceleration = cosine * u_north + sine * u_east

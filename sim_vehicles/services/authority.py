@@ -2,8 +2,10 @@
 
 from collections import Counter
 
+from scenarios.kernel import Cell
 from scenarios.schema import NS_PER_S
 from sim_vehicles.services import mavlink
+from sim_vehicles.services.hot import NOBODY, Place
 from sim_vehicles.services.mavlink import Command, Read, Setpoint
 from sim_vehicles.services.messages import DataStream, ParameterSet, SetMode
 
@@ -20,12 +22,14 @@ class Authority:
     set rates as soon as they start.
     """
 
-    def __init__(self, silence_s: float) -> None:
-        self.station: int | None = None
+    station = Cell[int | None](NOBODY)
+    commanded_ns = Cell[int]()
+    """When the station last commanded the vehicle; questions and heartbeats do not count."""
+    _heard_ns = Cell[int]()
+
+    def __init__(self, place: Place, silence_s: float) -> None:
+        _, self._columns, self._row = place
         self._silence_ns = round(silence_s * NS_PER_S)
-        self.commanded_ns = 0
-        """When the station last commanded the vehicle; questions and heartbeats do not count."""
-        self._heard_ns = 0
         self._refused: set[int] = set()
 
     def obeys(self, source: int, message: Read, time_ns: int) -> bool:

@@ -3,11 +3,26 @@
 from dataclasses import dataclass
 from typing import Self
 
+from scenarios.kernel import kernel
 from scenarios.schema import NS_PER_S, Clocks
 from sim_vehicles.services.draws import Use, draws_of
 
 NS_PER_MS = 1_000_000
 PARTS = 1_000_000_000
+
+
+@kernel
+def boot_ns(start_ns: int, offset_ns: int, drift_ppb: int, host_ns: int) -> int:
+    """What a clock shows. Whole seconds are multiplied apart: times `PARTS`, nine of them would not fit 64 bits."""
+    whole, rest = divmod(host_ns - start_ns, PARTS)
+    return offset_ns + (host_ns - start_ns) + whole * drift_ppb + rest * drift_ppb // PARTS
+
+
+@kernel
+def host_ns(start_ns: int, offset_ns: int, drift_ppb: int, boot_ns: int) -> int:
+    """The first host nanosecond at which a clock shows at least `boot_ns`."""
+    whole, rest = divmod(offset_ns - boot_ns, PARTS + drift_ppb)
+    return start_ns - whole * PARTS - rest * PARTS // (PARTS + drift_ppb)
 
 
 @dataclass(frozen=True)
@@ -26,12 +41,12 @@ class BootClock:
         offset_ns = int(offset * clocks.offset_max_s * NS_PER_S)
         return cls(start_ns, offset_ns, round((2.0 * drift - 1.0) * clocks.drift_max_ppm * 1000.0))
 
-    def boot_ns(self, host_ns: int) -> int:
-        return self.offset_ns + (host_ns - self.start_ns) * (PARTS + self.drift_ppb) // PARTS
+    def boot_ns(self, host_time_ns: int) -> int:
+        return boot_ns(self.start_ns, self.offset_ns, self.drift_ppb, host_time_ns)
 
-    def host_ns(self, boot_ns: int) -> int:
-        """The first host nanosecond at which the clock shows at least `boot_ns`."""
-        return self.start_ns - (self.offset_ns - boot_ns) * PARTS // (PARTS + self.drift_ppb)
+    def host_ns(self, boot_time_ns: int) -> int:
+        """The first host nanosecond at which the clock shows at least `boot_time_ns`."""
+        return host_ns(self.start_ns, self.offset_ns, self.drift_ppb, boot_time_ns)
 
 
 NEVER_NS = 2**63 - 1

@@ -9,10 +9,24 @@ import struct
 from collections import Counter
 from typing import Any, NamedTuple
 
+import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.services.messages import REQUESTS, Message, Request
+from scenarios.kernel import Cell, Records, kernel
+from sim_vehicles.services.frames import (
+    ARDUPILOT,
+    FRAME_BYTES,
+    PAYLOAD,
+    Frame,
+    finish,
+    global_position,
+    heartbeat,
+    local_position,
+    timesync,
+)
+from sim_vehicles.services.hot import Place
+from sim_vehicles.services.messages import REQUESTS, Condition, Message, Request
 
 MAGIC_1, MAGIC_2 = dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2
 HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialect.MAVLINK_SIGNATURE_BLOCK_LEN
@@ -54,7 +68,6 @@ CRC_EXTRA: dict[int, bytes] = {
     number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items() if number != SETUP_SIGNING
 }
 """The CRC_EXTRA of accepted messages; SETUP_SIGNING is not one: no key is accepted from a link."""
-_LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
 _DECODER = dialect.MAVLink(None)
@@ -209,17 +222,66 @@ def _command(frame: bytes) -> Command:
     return Command((frame[5], frame[6]), *target, asked.command, asked.param1, asked.param2, asked.param3, *last)
 
 
+@kernel
+def _local_position_at(
+    vehicles: Records, row: int, frame: Frame, boot_ms: int, north: float, east: float, down: float,
+    v_north: float, v_east: float, v_down: float,
+) -> int:  # fmt: skip
+    return local_position(frame, vehicles[row], boot_ms, north, east, down, v_north, v_east, v_down)
+
+
+@kernel
+def _global_position_at(
+    vehicles: Records, row: int, frame: Frame, boot_ms: int, latitude_deg: float, longitude_deg: float,
+    altitude_m: float, v_north: float, v_east: float, v_down: float, yaw_rad: float,
+) -> int:  # fmt: skip
+    return global_position(
+        frame, vehicles[row], boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, v_down, yaw_rad
+    )
+
+
+@kernel
+def _heartbeat_at(
+    vehicles: Records, row: int, frame: Frame, mode: int, autopilot: int,
+    armed: bool, guided: bool, flying: bool, critical: bool,
+) -> int:  # fmt: skip
+    return heartbeat(frame, vehicles[row], mode, autopilot, armed, guided, flying, critical)
+
+
+@kernel
+def _timesync_at(vehicles: Records, row: int, frame: Frame, tc1: int, ts1: int) -> int:
+    return timesync(frame, vehicles[row], tc1, ts1)
+
+
+@kernel
+def _finish_at(vehicles: Records, row: int, frame: Frame, extra: int) -> int:
+    return finish(frame, vehicles[row], extra)
+
+
 class Encoder:
     """Makes one vehicle's frames, with sequence numbers in the order of the calls."""
 
-    def __init__(self, system_id: int) -> None:
-        self.system_id = system_id
-        self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
+    sequence = Cell[int]()
+
+    def __init__(self, place: Place) -> None:
+        self._vehicles, self._columns, self._row = place
+        self.system_id: int = self._columns["system_id"][self._row]
+        self._pymavlink = dialect.MAVLink(None, srcSystem=self.system_id, srcComponent=COMPONENT_AUTOPILOT)
+        self._frame = np.zeros(FRAME_BYTES, np.uint8)
 
     def local_position(self, time_boot_ms: int, position: Triple, velocity: Triple) -> bytes:
         """LOCAL_POSITION_NED in m and m/s."""
-        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, *position, *velocity)
-        return self.frame(LOCAL_POSITION, payload)
+        size = _local_position_at(self._vehicles, self._row, self._frame, time_boot_ms, *position, *velocity)
+        return self._frame[:size].tobytes()
+
+    def global_position(self, at: Condition) -> bytes:
+        """GLOBAL_POSITION_INT; zeros where there is no position, as ArduPilot sends them."""
+        place = at.place_deg if at.has_position else (0.0, 0.0)
+        size = _global_position_at(
+            self._vehicles, self._row, self._frame,
+            at.time_boot_ms, *place, at.altitude_m, *at.velocity_ned_m_s, at.attitude_rad[2],
+        )  # fmt: skip
+        return self._frame[:size].tobytes()
 
     def heartbeat(
         self,
@@ -229,19 +291,16 @@ class Encoder:
         flying: bool,
         critical: bool,
         guided: bool = False,
-        autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        autopilot: int = ARDUPILOT,
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
-        base_mode = BASE_MODE_CUSTOM | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
-        base_mode |= dialect.MAV_MODE_FLAG_GUIDED_ENABLED if guided else 0
-        status = dialect.MAV_STATE_ACTIVE if flying else dialect.MAV_STATE_STANDBY
-        status = dialect.MAV_STATE_CRITICAL if critical else status
-        kind = dialect.MAV_TYPE_QUADROTOR, autopilot
-        return self.pack(dialect.MAVLink_heartbeat_message(*kind, base_mode, mode, status, 3))
+        size = _heartbeat_at(self._vehicles, self._row, self._frame, mode, autopilot, armed, guided, flying, critical)
+        return self._frame[:size].tobytes()
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
         """TIMESYNC, a request if tc1 is 0."""
-        return self.frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
+        size = _timesync_at(self._vehicles, self._row, self._frame, tc1, ts1)
+        return self._frame[:size].tobytes()
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
         system, component = requester
@@ -256,13 +315,13 @@ class Encoder:
 
     def frame(self, number: int, payload: bytes) -> bytes:
         """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
-        payload = payload.rstrip(b"\0") or b"\0"
-        mav = self._pymavlink
-        body = bytes((len(payload), 0, 0, mav.seq, mav.srcSystem, COMPONENT_AUTOPILOT, number, 0, 0)) + payload
-        mav.seq = (mav.seq + 1) & 0xFF
-        return b"\xfd" + body + mcrf4xx(body + CRC_EXTRA[number]).to_bytes(2, "little")
+        self._frame[PAYLOAD : PAYLOAD + len(payload)] = np.frombuffer(payload, np.uint8)
+        self._frame[1], self._frame[7] = len(payload), number
+        size = _finish_at(self._vehicles, self._row, self._frame, CRC_EXTRA[number][0])
+        return self._frame[:size].tobytes()
 
     def pack(self, message: Message) -> bytes:
+        self._pymavlink.seq = self.sequence
         frame = message.pack(self._pymavlink)
-        self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
+        self.sequence = (self.sequence + 1) & 0xFF
         return frame

@@ -6,6 +6,7 @@ from typing import NamedTuple, get_args
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M, ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG
+from sim_vehicles.services.frames import clipped
 
 Message = dialect.MAVLink_message
 ParameterList = dialect.MAVLink_param_request_list_message
@@ -132,7 +133,7 @@ def home_position(
     local_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Message:
     """HOME_POSITION, on the ground, on the globe and in the local frame."""
-    place = *_degrees_e7(place_deg), _clipped(ORIGIN_ALTITUDE_M * 1e3, _INT32)
+    place = *_degrees_e7(place_deg), clipped(ORIGIN_ALTITUDE_M * 1e3, _INT32)
     return dialect.MAVLink_home_position_message(*place, *local_ned_m, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
@@ -180,19 +181,12 @@ class Condition(NamedTuple):
 
 
 def report(message_id: int, at: Condition) -> Message:
-    """GLOBAL_POSITION_INT or one of EXTRA; a value that does not fit its field is clipped."""
+    """One of EXTRA; a value that does not fit its field is clipped."""
     north, east, down = at.velocity_ned_m_s
     speed_m_s, heading_deg = math.hypot(north, east), math.degrees(at.attitude_rad[2]) % 360.0
     # Without a position it sends zeros, as ArduPilot does.
     latitude, longitude = _degrees_e7(at.place_deg if at.has_position else (0.0, 0.0))
-    altitude = _clipped(at.altitude_m * 1e3, _INT32)
-    if message_id == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
-        relative = _clipped((at.altitude_m - ORIGIN_ALTITUDE_M) * 1e3, _INT32)
-        v_north, v_east, v_down = (_clipped(speed * 1e2, _INT16) for speed in at.velocity_ned_m_s)
-        heading = round(heading_deg * 1e2) % 36_000
-        return dialect.MAVLink_global_position_int_message(
-            at.time_boot_ms, latitude, longitude, altitude, relative, v_north, v_east, v_down, heading
-        )
+    altitude = clipped(at.altitude_m * 1e3, _INT32)
     if message_id == SYS_STATUS:  # the battery is always full
         health = _GEOFENCE | (_ALL_SENSORS if at.has_position else _SENSORS)
         present = _ALL_SENSORS
@@ -218,8 +212,4 @@ def report(message_id: int, at: Condition) -> Message:
 
 def _degrees_e7(place_deg: tuple[float, float]) -> tuple[int, int]:
     latitude_deg, longitude_deg = place_deg
-    return _clipped(latitude_deg * 1e7, _INT32), _clipped(longitude_deg * 1e7, _INT32)
-
-
-def _clipped(value: float, largest: int) -> int:
-    return max(-largest, min(largest, round(value)))
+    return clipped(latitude_deg * 1e7, _INT32), clipped(longitude_deg * 1e7, _INT32)

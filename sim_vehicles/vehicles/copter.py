@@ -59,6 +59,7 @@ class Copter:
         self.settings = scenario.autopilot
         self.rules = RULES[own.flavour or scenario.autopilot.flavour]
         self.version, self.version_1_first = self.rules.version, self.rules.version_1_first
+        self.is_plain = False
         self.parameters = parameters(self.rules, own.system_id, self.settings)
         self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
@@ -111,7 +112,7 @@ class Copter:
 
     def happen(self, time_ns: int) -> None:
         """Run the event at the deadline: a jump, a complaint, a disarming on the ground, or set-points that stop."""
-        self._advance(time_ns)
+        self.move(time_ns)
         if time_ns == self._jump[0]:
             _, by_ns, text = self._jump
             self._jump = next(self._jumps, _NO_JUMP)
@@ -146,7 +147,7 @@ class Copter:
 
     def acts_at(self, time_ns: int) -> int:
         """When a message that arrives at `time_ns` acts, in ns: never before one that has already acted."""
-        self._advance(time_ns)
+        self.move(time_ns)
         return self._motion_ns
 
     def hear_heartbeat(self, time_ns: int) -> None: ...  # without effect
@@ -166,7 +167,7 @@ class Copter:
         if not self.landed:
             self._takeoff_m = None  # a set-point ends a guided take-off at the present altitude
             self._target = target
-            self._radio.acted(setpoint, time_ns)
+            self._radio.acted(setpoint.time_boot_ms, time_ns)
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
@@ -270,9 +271,11 @@ class Copter:
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             return encoder.local_position(boot_ms, (*place, down_m), (*velocity, -motion.climb_m_s))
+        if message_id == mavlink.GLOBAL_POSITION:
+            return encoder.global_position(self._condition(boot_ms, has_position=ready))
         if message_id == self.rules.estimator_message:
             message = messages.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if ready else NOT_READY_FLAGS)
-        elif message_id == mavlink.GLOBAL_POSITION or message_id in messages.EXTRA:
+        elif message_id in messages.EXTRA:
             message = messages.report(message_id, self._condition(boot_ms, has_position=ready))
         elif message_id == mavlink.GLOBAL_ORIGIN and ready:
             message = messages.global_origin(degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
@@ -350,7 +353,7 @@ class Copter:
         own = self.motion, self._target
         return self._air.moved(own, move, shift, self._motion_ns, time_ns, foreseen=foreseen)
 
-    def _advance(self, time_ns: int) -> None:
+    def move(self, time_ns: int) -> None:
         if time_ns <= self._motion_ns:
             return
         if not self.landed:

@@ -5,9 +5,10 @@ which, armed and in GUIDED, it accepts a take-off command or its first set-point
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from scenarios import schema
+from scenarios.kernel import Cell, Records, kernel
 from scenarios.keys.own import aircraft_of, names_code
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.air import Air, Push, air_of
@@ -15,14 +16,22 @@ from sim_vehicles.motion.aircraft import Aircraft, Attitude
 from sim_vehicles.motion.double_integrator import (
     COAST,
     VELOCITY_GAIN_1_S,
+    Bounds,
     Command,
     State,
     advance,
+    advance_to,
     bounds_of,
+    command_of,
     limited,
+    push_on,
+    pushed,
     rates,
+    set_command,
+    set_state,
     shifted,
     state_from,
+    state_of,
 )
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.motion.own import OwnMotion
@@ -53,8 +62,39 @@ CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the c
 _ACCELERATION_ONLY = POSITION_AXES | VELOCITY_AXES | YAW_IGNORED | YAW_RATE_IGNORED
 
 
+Step = Callable[[State, Command, Bounds, float], State]
 LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
+
+
+@kernel
+def _state_at(vehicles: Records, row: int) -> State:
+    return state_of(vehicles[row])
+
+
+@kernel
+def _set_state_at(vehicles: Records, row: int, state: State) -> None:
+    set_state(vehicles[row], state)
+
+
+@kernel
+def _command_at(vehicles: Records, row: int) -> Command:
+    return command_of(vehicles[row])
+
+
+@kernel
+def _set_command_at(vehicles: Records, row: int, command: Command) -> None:
+    set_command(vehicles[row], command)
+
+
+@kernel
+def _push_on_at(vehicles: Records, row: int, piece: tuple[float, float, float, float, float]) -> None:
+    push_on(vehicles[row], piece)
+
+
+@kernel
+def _advance_to_at(vehicles: Records, row: int, time_ns: int) -> None:
+    advance_to(vehicles[row], time_ns)
 
 
 class DoubleIntegrator:
@@ -71,11 +111,15 @@ class DoubleIntegrator:
     }
     """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
 
+    _state_ns = Cell[int]()
+    _altitude_m = Cell[float]()
+
     def __init__(
         self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: VehicleLoop | None = None
     ) -> None:
         safety = scenario.safety
-        self.flight = FlightMode(safety)
+        self._vehicles, self._columns, self._row = radio.place
+        self.flight = FlightMode(safety, radio.place)
         timeouts = (
             timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
             timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
@@ -85,11 +129,12 @@ class DoubleIntegrator:
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
-        self._altitude_m = scenario.altitude_of(own)
         self._bounds = bounds_of(scenario.limits)
+        for name, bound in self._bounds._asdict().items():
+            self._columns[name][self._row] = bound
+        self._altitude_m = scenario.altitude_of(own)
         self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
-        self._command = COAST
         self._air = air_of(scenario, own.system_id, radio.start_ns, radio.record)
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
         self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
@@ -100,6 +145,24 @@ class DoubleIntegrator:
         self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
         if onboard is not None:
             radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
+        self.is_plain = all(part is None for part in (self._own, self._hold, self._navigator, onboard))
+        self._columns["pushed"][self._row] = self._air is not None
+
+    @property
+    def _state(self) -> State:
+        return _state_at(self._vehicles, self._row)
+
+    @_state.setter
+    def _state(self, state: State) -> None:
+        _set_state_at(self._vehicles, self._row, state)
+
+    @property
+    def _command(self) -> Command:
+        return _command_at(self._vehicles, self._row)
+
+    @_command.setter
+    def _command(self, command: Command) -> None:
+        _set_command_at(self._vehicles, self._row, command)
 
     @property
     def deadline_ns(self) -> int:
@@ -112,9 +175,14 @@ class DoubleIntegrator:
         """The true state at a time after the last event, if nothing arrives until then."""
         if not self.flight.flying or time_ns <= self._state_ns:
             return self._state
-        if self._air is not None:
-            return self._pushed(self._air, time_ns, foreseen=True)
-        return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+        if self._air is None:
+            return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+        if self._own is not None:
+            return self._own_motion(self._own.foreseen, self._air, time_ns, foreseen=True)
+        state = self._state
+        for piece in self._air.pieces(self._state_ns, time_ns, foreseen=True):
+            state = pushed(state, self._command, self._bounds, piece)
+        return state
 
     def acts_at(self, time_ns: int) -> int:
         """The instant at which a message that arrives now acts: never before one that has already acted."""
@@ -146,7 +214,7 @@ class DoubleIntegrator:
         if on_launcher:
             self._state_ns = time_ns  # the launcher has held it until now
             self._radio.tell(time_ns, "flying")
-        self._advance(time_ns)
+        self.move(time_ns)
         if setpoint.frame != mavlink.FRAME_LOCAL_NED:
             setpoint = to_local(setpoint, self._state.yaw_rad)
         north, east, _ = setpoint.acceleration_ned_m_s2
@@ -159,7 +227,7 @@ class DoubleIntegrator:
             self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
         else:
             self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
-        self._radio.acted(setpoint, time_ns)
+        self._radio.acted(setpoint.time_boot_ms, time_ns)
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
@@ -211,7 +279,7 @@ class DoubleIntegrator:
         before = (self.flight.mode, self.flight.failsafe)
         result = self.flight.set_mode(mode, time_ns)
         if (self.flight.mode, self.flight.failsafe) != before:
-            self._advance(time_ns)
+            self.move(time_ns)
             self._command = self._alone()
             self._radio.tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result, ""
@@ -222,7 +290,7 @@ class DoubleIntegrator:
         if self._hold is not None and self._hold.next_ns <= time_ns:
             self._radio.counters[self._fly(self._hold.pop(), max(time_ns, self._state_ns))] += 1
             return
-        self._advance(time_ns)
+        self.move(time_ns)
         self.flight.fail()
         self._command = self._alone()
         text = f"failsafe: {self.flight.failsafe} stopped"
@@ -245,7 +313,7 @@ class DoubleIntegrator:
         onboard = self._onboard
         if onboard is None or not onboard.on:
             return
-        self._advance(time_ns)
+        self.move(time_ns)
         onboard.step(time_ns, boot_ms, self._state)
         if self._own_loop_flies(onboard):
             self._command = onboard.command()
@@ -265,7 +333,7 @@ class DoubleIntegrator:
             )
         if message_id == mavlink.HOME_POSITION:
             return encoder.pack(messages.home_position())
-        self._advance(time_ns)
+        self.move(time_ns)
         if message_id == mavlink.LOCAL_POSITION:
             state = self._state
             place, velocity = state[0:2], state.velocity_ne_m_s()
@@ -276,7 +344,9 @@ class DoubleIntegrator:
             return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
         if message_id in (mavlink.POSITION_TARGET, messages.NAMED_INT):
             return self._active_target(boot_ms) if message_id == mavlink.POSITION_TARGET else self._lag(boot_ms)
-        return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
+        condition = self._condition(boot_ms)
+        is_global = message_id == mavlink.GLOBAL_POSITION
+        return encoder.global_position(condition) if is_global else encoder.pack(messages.report(message_id, condition))
 
     def _lag(self, boot_ms: int) -> bytes | None:
         """The lag after which held set-points act; None before the first."""
@@ -318,27 +388,29 @@ class DoubleIntegrator:
             has_position=True,
         )
 
-    def _advance(self, time_ns: int) -> None:
-        if time_ns > self._state_ns:
-            if self.flight.flying and self._air is not None:
-                self._state = self._pushed(self._air, time_ns)
-            elif self.flight.flying:
-                self._state = advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+    def move(self, time_ns: int) -> None:
+        if self._air is None or not self.flight.flying:
+            _advance_to_at(self._vehicles, self._row, time_ns)
+        elif time_ns > self._state_ns:
+            if self._own is None:
+                for piece in self._air.pieces(self._state_ns, time_ns):
+                    _push_on_at(self._vehicles, self._row, piece)
+            else:
+                self._state = self._own_motion(self._own.advance, self._air, time_ns)
             self._state_ns = time_ns
 
     def push(self, push: Push, time_ns: int) -> None:
         """Set the push that acts from now on, in addition to wind and gusts."""
         assert self._air is not None
-        self._advance(time_ns)
+        self.move(time_ns)
         self._air.add(push)
 
-    def _pushed(self, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
-        moved = advance
-        if self._own is not None:
-            moved = self._own.foreseen if foreseen else self._own.advance
+    def _own_motion(self, moved: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
+        """The state at a time by dynamics in place of the double integrator's."""
+        command = self._command
 
         def move(state: State, duration_s: float) -> State:
-            return moved(state, self._command, self._bounds, duration_s)
+            return moved(state, command, self._bounds, duration_s)
 
         return air.moved(self._state, move, shifted, self._state_ns, time_ns, foreseen=foreseen)
 

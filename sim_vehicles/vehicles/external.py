@@ -40,6 +40,7 @@ class ExternallyFlown:
         self.craft = craft
         self.parameters: Parameters = craft.parameters
         self.version: tuple[int, int, int] = craft.version
+        self.is_plain = False
         self.version_1_first: bool = craft.version_1_first
         self.intervals_us: Mapping[int, int] = craft.intervals_us
         self.reports_from_ns: int = craft.reports_from_ns
@@ -111,6 +112,9 @@ class ExternallyFlown:
 
     def acts_at(self, time_ns: int) -> int:
         return self.craft.acts_at(time_ns)
+
+    def move(self, time_ns: int) -> None:
+        self.craft.move(time_ns)
 
     def hear_heartbeat(self, time_ns: int) -> None: ...  # without effect
 

@@ -9,28 +9,89 @@ on the launcher ──first set-point or take-off, armed, GUIDED──► flying
 LOITER and BRAKE both hold the course: ground stations send either for "hold".
 """
 
+from scenarios.kernel import Cell, Record, Records, kernel
 from scenarios.schema import NS_PER_S, Safety
 from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.hot import Place
 from sim_vehicles.services.mavlink import ACCEPTED, DENIED, MODE_BRAKE, MODE_GUIDED, MODE_LOITER, MODE_STABILIZE
 
 MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "LOITER", MODE_BRAKE: "BRAKE"}
 
 
+_STOPPED = ("", "set-points", "station heartbeat")
+"""Which stream stopped, by its number in the record; the first outside the failsafe."""
+
+
+@kernel
+def takes_setpoints(vehicle: Record) -> bool:
+    """Whether the vehicle flies and obeys set-points."""
+    return vehicle.flying and vehicle.armed and vehicle.mode == MODE_GUIDED and vehicle.stopped == 0
+
+
+@kernel
+def note_setpoint(vehicle: Record, now_ns: int) -> None:
+    """Restart the time-out of set-points."""
+    if now_ns > vehicle.setpoint_ns or vehicle.setpoint_ns == NEVER_NS:
+        vehicle.setpoint_ns = now_ns
+    set_deadline(vehicle)
+
+
+@kernel
+def note_heartbeat(vehicle: Record, now_ns: int) -> None:
+    """Restart the time-out of the station's heartbeats."""
+    vehicle.heartbeat_ns = max(vehicle.heartbeat_ns, now_ns)
+    set_deadline(vehicle)
+
+
+@kernel
+def set_deadline(vehicle: Record) -> None:
+    if not vehicle.flying or vehicle.stopped != 0:
+        vehicle.deadline_ns = NEVER_NS
+        return
+    vehicle.deadline_ns = vehicle.heartbeat_ns + vehicle.heartbeat_timeout_ns
+    if vehicle.mode == MODE_GUIDED and vehicle.setpoint_ns != NEVER_NS:  # a commanded hold needs no set-points
+        vehicle.deadline_ns = min(vehicle.deadline_ns, vehicle.setpoint_ns + vehicle.setpoint_timeout_ns)
+
+
+@kernel
+def _note_setpoint_at(vehicles: Records, row: int, now_ns: int) -> None:
+    note_setpoint(vehicles[row], now_ns)
+
+
+@kernel
+def _note_heartbeat_at(vehicles: Records, row: int, now_ns: int) -> None:
+    note_heartbeat(vehicles[row], now_ns)
+
+
+@kernel
+def _set_deadline_at(vehicles: Records, row: int) -> None:
+    set_deadline(vehicles[row])
+
+
 class FlightMode:
     """The mode of one vehicle. Every method takes the instant at which its event happens."""
 
-    def __init__(self, safety: Safety) -> None:
-        self.armed = False
+    armed = Cell[bool]()
+    mode = Cell[int]()
+    flying = Cell[bool]()
+    deadline_ns = Cell[int]()
+    """When the failsafe begins unless a station is heard before."""
+    _stopped = Cell[int]()
+    _setpoint_ns = Cell[int]()
+    _setpoint_timeout_ns = Cell[int]()
+    _heartbeat_ns = Cell[int]()
+    _heartbeat_timeout_ns = Cell[int]()
+
+    def __init__(self, safety: Safety, place: Place) -> None:
+        self._vehicles, self._columns, self._row = place
         self.mode = MODE_STABILIZE
-        self.flying = False
-        self.failsafe = ""
-        """Which stream stopped; empty outside the failsafe."""
-        self.deadline_ns = NEVER_NS
-        """When the failsafe begins unless a station is heard before."""
         self._setpoint_timeout_ns = round(safety.setpoint_timeout_s * NS_PER_S)
         self._heartbeat_timeout_ns = round(safety.heartbeat_timeout_s * NS_PER_S)
-        self._setpoint_ns = 0
-        self._heartbeat_ns = 0
+
+    @property
+    def failsafe(self) -> str:
+        """Which stream stopped; empty outside the failsafe."""
+        return _STOPPED[self._stopped]
 
     def set_timeouts(self, setpoint_s: float, heartbeat_s: float, now_ns: int) -> None:
         """Set how long the station may be silent; both timers restart if that changes."""
@@ -41,8 +102,7 @@ class FlightMode:
             self._set_deadline()
 
     def hear_heartbeat(self, now_ns: int) -> None:
-        self._heartbeat_ns = max(self._heartbeat_ns, now_ns)
-        self._set_deadline()
+        _note_heartbeat_at(self._vehicles, self._row, now_ns)
 
     def accept_setpoint(self, now_ns: int) -> str:
         """Accept a set-point; the first begins the flight. Returns the reason if it is ignored, else ""."""
@@ -55,9 +115,7 @@ class FlightMode:
         if not self.flying:
             self.flying = True
             self._heartbeat_ns = now_ns  # time before the flight does not count as silence
-        if now_ns > self._setpoint_ns or self._setpoint_ns == NEVER_NS:
-            self._setpoint_ns = now_ns
-        self._set_deadline()
+        _note_setpoint_at(self._vehicles, self._row, now_ns)
         return ""
 
     def take_off(self, now_ns: int) -> int:
@@ -85,7 +143,7 @@ class FlightMode:
             return DENIED
         if mode != self.mode or self.failsafe:
             self.mode = mode
-            self.failsafe = ""
+            self._stopped = 0
             self._setpoint_ns = self._heartbeat_ns = now_ns
             self._set_deadline()
         return ACCEPTED
@@ -96,14 +154,9 @@ class FlightMode:
         setpoints_stopped = (
             self.mode == MODE_GUIDED and self.deadline_ns == self._setpoint_ns + self._setpoint_timeout_ns
         )
-        self.failsafe = "set-points" if setpoints_stopped else "station heartbeat"
+        self._stopped = 1 if setpoints_stopped else 2
         self.mode = MODE_LOITER
         self._set_deadline()
 
     def _set_deadline(self) -> None:
-        if not self.flying or self.failsafe:
-            self.deadline_ns = NEVER_NS
-            return
-        self.deadline_ns = self._heartbeat_ns + self._heartbeat_timeout_ns
-        if self.mode == MODE_GUIDED:  # a commanded hold needs no set-points
-            self.deadline_ns = min(self.deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
+        _set_deadline_at(self._vehicles, self._row)

@@ -9,17 +9,22 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
+import numpy as np
+
 from scenarios import schema
 from sim_vehicles.links.truth import ACTED, SAMPLED, Record
 from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
+from sim_vehicles.services.frames import FRAME_BYTES, PAYLOAD
+from sim_vehicles.services.hot import COUNTED, Place, new_vehicles, place_in
 from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
 from sim_vehicles.services.services import Services
 from sim_vehicles.services.sitl import backdating_ns
+from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, UNUSUAL, hear_at, report_at
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
@@ -43,23 +48,39 @@ class Radio:
 
     `counters` counts received messages: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`,
     and by reason those not obeyed: `refused_...` are invalid, `ignored_...` are valid but not for this vehicle, or not
-    now.
+    now. Those that kernels count are in the vehicle's record until `take_counts` adds them.
     """
 
     def __init__(
-        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, record: Record | None = None
+        self,
+        scenario: schema.Scenario,
+        own: schema.Vehicle,
+        start_ns: int,
+        record: Record | None = None,
+        place: Place | None = None,
     ) -> None:
+        self.place = place or place_in(new_vehicles(1))
+        self.place.columns["system_id"][self.place.row] = own.system_id
         self.system_id = own.system_id
         self.start_ns = start_ns
         self.counters: Counter[str] = Counter()
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
         """The newest at the end; a reader may clear it."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
-        self.schedule = Schedule(self.clock)
-        self.encoder = mavlink.Encoder(own.system_id)
+        self.schedule = Schedule(self.clock, self.place)
+        self.encoder = mavlink.Encoder(self.place)
         self.record = record
         self.out: list[tuple[bytes, int]] = []
         """Frames sent in this step, with their instants."""
+
+    def take_counts(self) -> Counter[str]:
+        """The counters, with what kernels have counted."""
+        _, columns, row = self.place
+        for name in COUNTED:
+            if count := columns[name][row]:
+                self.counters[name] += count
+                columns[name][row] = 0
+        return self.counters
 
     def send(self, frame: bytes, time_ns: int) -> None:
         self.out.append((frame, time_ns))
@@ -72,10 +93,15 @@ class Radio:
         """Note a change, for whoever runs the simulation."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
-    def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
+    def acted(self, setpoint_boot_ms: int, time_ns: int) -> None:
         """Record in the truth log that a set-point acts from now on."""
         if self.record is not None:
-            self.record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
+            self.record((ACTED, self.system_id, setpoint_boot_ms, time_ns, time_ns, time_ns))
+
+    def sampled(self, boot_ms: int, time_ns: int) -> None:
+        """Record in the truth log when the state in a position report was sampled."""
+        if self.record is not None:
+            self.record((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
         self.clock = clock
@@ -88,6 +114,9 @@ class Craft(Protocol):
     parameters: Parameters
     version: tuple[int, int, int]
     """The version that AUTOPILOT_VERSION reports."""
+    is_plain: bool
+    """Whether it is a double integrator whose set-points act at once, and which reports its true state. Then kernels
+    run its usual events, see `plain`."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does."""
     intervals_us: Mapping[int, int]
@@ -101,6 +130,7 @@ class Craft(Protocol):
     def happen(self, time_ns: int) -> None: ...
     def state_at(self, time_ns: int) -> State: ...
     def acts_at(self, time_ns: int) -> int: ...
+    def move(self, time_ns: int) -> None: ...  # to a time, if that is not past
     def hear_heartbeat(self, time_ns: int) -> None: ...
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the counter to increment
@@ -122,10 +152,12 @@ class Shell(Generic[Flown]):
         self.system_id = radio.system_id
         self.craft = craft
         self.radio = radio
-        self.counters, self.changes = radio.counters, radio.changes
-        self.authority = Authority(scenario.safety.heartbeat_timeout_s)
+        self.changes = radio.changes
+        self.authority = Authority(radio.place, scenario.safety.heartbeat_timeout_s)
         self._speaks_version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
         self._timesync_ts1 = -1
+        self._frames = np.zeros((2, FRAME_BYTES), np.uint8)
+        """A datagram, and the frame that a kernel makes."""
         self._backdating_ns = backdating_ns(scenario, radio.system_id)
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule
@@ -139,6 +171,10 @@ class Shell(Generic[Flown]):
         self.services = Services(
             radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
         )
+
+    @property
+    def counters(self) -> Counter[str]:
+        return self.radio.take_counts()
 
     @property
     def next_event_ns(self) -> int:
@@ -163,14 +199,14 @@ class Shell(Generic[Flown]):
         """Run everything due before the end; at one instant the deadline first, so that reports show its effect."""
         schedule, craft = self._schedule, self.craft
         while True:
-            deadline_ns = craft.deadline_ns
-            if deadline_ns <= schedule.next_ns:
+            deadline_ns, scheduled_ns = craft.deadline_ns, schedule.next_ns
+            if deadline_ns <= scheduled_ns:
                 if deadline_ns >= end_ns:
                     return
                 craft.happen(deadline_ns)
-            elif schedule.next_ns >= end_ns:
+            elif scheduled_ns >= end_ns:
                 return
-            else:
+            elif not self._reports_plainly(scheduled_ns):
                 self._report(*schedule.pop())
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
@@ -188,12 +224,47 @@ class Shell(Generic[Flown]):
             if own is None:
                 return
             frame = mavlink.in_version_1(own) if self._speaks_version_1 else own
-            if message_id == mavlink.LOCAL_POSITION and radio.record is not None:
-                radio.record((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
+            if message_id == mavlink.LOCAL_POSITION:
+                radio.sampled(boot_ms, time_ns)
         radio.send(frame, time_ns)
 
+    def _reports_plainly(self, time_ns: int) -> bool:
+        """Send the report that is due, if a kernel can."""
+        radio, (vehicles, _, row) = self.radio, self.radio.place
+        size = report_at(vehicles, row, self._frames) if self.craft.is_plain else UNUSUAL
+        if size == MOVE_FIRST:
+            self.craft.move(time_ns)
+            size = report_at(vehicles, row, self._frames)
+        if size == UNUSUAL:
+            return False
+        frame = self._frames[1, :size].tobytes()
+        if mavlink.message_id(frame) == mavlink.LOCAL_POSITION:
+            radio.sampled(_boot_ms(frame), time_ns)
+        radio.send(frame, time_ns)
+        return True
+
+    def _hears_plainly(self, data: bytes, time_ns: int) -> bool:
+        """Act on a datagram, if a kernel can."""
+        if not self.craft.is_plain or len(data) > FRAME_BYTES:
+            return False
+        radio, (vehicles, _, row) = self.radio, self.radio.place
+        received = np.frombuffer(data, np.uint8)
+        size = hear_at(vehicles, row, received, time_ns, self._frames)
+        if size == MOVE_FIRST:
+            self.craft.move(self.craft.acts_at(time_ns))
+            size = hear_at(vehicles, row, received, time_ns, self._frames)
+        if size == UNUSUAL:
+            return False
+        if size != SILENT:
+            radio.send(self._frames[1, :size].tobytes(), time_ns)
+        elif mavlink.message_id(data) == mavlink.SETPOINT:
+            radio.acted(_boot_ms(data), self.craft.acts_at(time_ns))
+        return True
+
     def _receive(self, data: bytes, time_ns: int) -> None:
-        counters, authority = self.counters, self.authority
+        if self._hears_plainly(data, time_ns):
+            return
+        counters, authority = self.radio.counters, self.authority
         for source, message in mavlink.read_datagram(data, counters):
             self._speaks_version_1 = False
             if isinstance(message, mavlink.Heartbeat):
@@ -211,28 +282,28 @@ class Shell(Generic[Flown]):
 
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
         if heartbeat.type != mavlink.TYPE_GCS:
-            self.counters["ignored_heartbeat"] += 1
+            self.radio.counters["ignored_heartbeat"] += 1
         elif not self.authority.hears(source, time_ns):
-            self.counters["ignored_not_the_station"] += 1
+            self.radio.counters["ignored_not_the_station"] += 1
         else:
-            self.counters["heartbeats"] += 1
+            self.radio.counters["heartbeats"] += 1
             self.craft.hear_heartbeat(time_ns)
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
         if message.target_system not in (0, self.system_id):
-            self.counters["ignored_not_addressed"] += 1
+            self.radio.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
-            self.counters["timesync_requests"] += 1
+            self.radio.counters["timesync_requests"] += 1
             # Never 0, even at boot: that would make the reply a request.
             tc1 = self.radio.clock.boot_ns(time_ns) - next(self._backdating_ns, 0) or 1
             self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
         else:  # an unrequested reply is for another vehicle, or a duplicate
             asked = message.ts1 == self._timesync_ts1
-            self.counters["timesync_replies" if asked else "ignored_timesync_reply"] += 1
+            self.radio.counters["timesync_replies" if asked else "ignored_timesync_reply"] += 1
 
     def _obey(self, message: mavlink.Asked, time_ns: int) -> None:
         if isinstance(message, mavlink.Setpoint):
-            self.counters[self.craft.take_setpoint(message, time_ns)] += 1
+            self.radio.counters[self.craft.take_setpoint(message, time_ns)] += 1
         elif isinstance(message, mavlink.Command):
             self._take_command(message, time_ns)
         elif isinstance(message, SetMode):
@@ -240,14 +311,14 @@ class Shell(Generic[Flown]):
             if text := self.craft.change_mode(mode, time_ns)[1]:
                 self.radio.say(time_ns, text)
         else:
-            for frame in self.services.answer(message, self.counters, time_ns):
+            for frame in self.services.answer(message, self.radio.counters, time_ns):
                 self.radio.send(frame, time_ns)
             if isinstance(message, ParameterSet):
                 self.craft.parameters_set(time_ns)
 
     def _take_command(self, command: mavlink.Command, time_ns: int) -> None:
         """Obey a command. The acknowledgement is sent before the messages that the command causes."""
-        self.counters["commands"] += 1
+        self.radio.counters["commands"] += 1
         radio, answer = self.radio, self.craft.command(command, time_ns)
         result, more = self.services.command(command, time_ns) if answer is None else (answer[0], [])
         radio.send(radio.encoder.command_ack(command.command, result, command.source), time_ns)
@@ -255,3 +326,8 @@ class Shell(Generic[Flown]):
             radio.send(radio.encoder.pack(message), time_ns)
         if answer is not None and answer[1]:
             radio.say(time_ns, answer[1])
+
+
+def _boot_ms(frame: bytes) -> int:
+    """The time_boot_ms with which the payloads of set-points and position reports begin."""
+    return int.from_bytes(frame[PAYLOAD : PAYLOAD + 4], "little")

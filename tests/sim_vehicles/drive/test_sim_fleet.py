@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.keys.link import Link, Links, VehicleLinks
+from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
 from sim_vehicles.drive.fleet import Datagram, Fleet
 from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, Row
 from tests.support.sim_client import (
@@ -70,6 +70,29 @@ def test_it_does_not_matter_how_often_it_is_stepped() -> None:
         for pace in (5 * MS, 20 * MS)
     )
     assert fine == coarse
+
+
+@pytest.mark.parametrize("reordering", [False, True])
+def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
+    """With a truth log every event goes through the shell."""
+    link = Link(
+        delay_s=0.03,
+        jitter=Jitter(distribution="normal", scale_s=0.02),
+        reordering=reordering,
+        loss_probability=0.05,
+        duplicate_probability=0.1,
+        corrupt_probability=0.05,
+    )
+    own = scenario(COUNT).model_copy(update={"links": Links(up=link, down=link)})
+    rows: list[Row] = []
+    plain, recorded = Fleet(own, START), Fleet(own, START, record=rows.append)
+    assert flight(plain) == flight(recorded)
+    assert plain.counters == recorded.counters
+    assert plain.next_event_ns == recorded.next_event_ns
+    assert [plain.state(k, START + 3 * SECOND) for k in plain.system_ids] == [
+        recorded.state(k, START + 3 * SECOND) for k in plain.system_ids
+    ]
+    assert sum(row[0] == ACTED for row in rows) > 100
 
 
 def test_what_is_returned_is_due_and_in_order() -> None:

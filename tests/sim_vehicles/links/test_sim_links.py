@@ -81,6 +81,30 @@ def test_a_ramp_is_exact_at_given_instants() -> None:
     }
 
 
+def test_a_datagram_longer_than_a_frame_fares_as_a_short_one() -> None:
+    behaviour = link_keys.Link(
+        delay_s=0.1,
+        jitter=Jitter(distribution="normal", scale_s=0.1),
+        reordering=True,
+        loss_probability=0.1,
+        duplicate_probability=0.3,
+        corrupt_probability=0.3,
+    )
+    short, long = Link(behaviour, seed=3, capacity=100), Link(behaviour, seed=3, capacity=100)
+    for number in range(200):
+        short.send(bytes(10), number)
+        long.send(bytes(5000), number)
+    of_short, of_long = short.due(NEVER_NS), long.due(NEVER_NS)
+    assert [(*entry[:3], *entry[4:]) for entry in of_short] == [(*entry[:3], *entry[4:]) for entry in of_long]
+    assert short.counts == long.counts
+    assert all(short.counts[name] for name in ("lost", "corrupted", "duplicated", "link_full"))
+    flips = {entry[1]: entry[3] for entry in of_long}
+    for _, number, _, data, fate, _ in of_long:
+        assert len(data) == 5000
+        assert bool(int.from_bytes(data).bit_count()) == bool(fate & CORRUPTED)
+        assert data == flips[number]
+
+
 def test_before_link_time_zero_the_first_delay_applies_without_outage() -> None:
     points = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=1.0, delay_s=0.5))
     link = Link(link_keys.Link(delay_points=points, outages=(Outage(from_s=0.0, until_s=9.0),)))

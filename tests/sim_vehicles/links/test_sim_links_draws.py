@@ -15,7 +15,6 @@ from scipy import stats
 
 from scenarios.keys import link as link_keys
 from scenarios.keys.link import Jitter, LossBursts
-from sim_vehicles.links.fate import flipped
 from sim_vehicles.links.links import Link, LinkSet
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, Row
 from sim_vehicles.services.clock import NEVER_NS
@@ -128,7 +127,8 @@ def test_corruption_flips_one_to_four_bits_anywhere() -> None:
     for bit in range(48):
         # 2.5 of 48 bits, but for those drawn twice: 5 % of 2000 datagrams. Standard deviation 10.
         assert 60 < sum(word >> bit & 1 for word in words) < 140
-    assert flipped(b"", (0.5,)) == b""
+    link.send(b"", 0)
+    assert [entry[3] for entry in link.due(NEVER_NS)] == [b""]
 
 
 def drawn_by(link: link_keys.Link, seed: int, others: int) -> list[list[tuple[int, ...]]]:

@@ -1,0 +1,68 @@
+"""What changes with every message of a vehicle, as one record for each: kernels and the vehicle's objects share it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from scenarios.kernel import Columns, Records
+from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.frames import GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION
+
+NOBODY = -1
+"""In place of the system id of a station."""
+
+VEHICLE = np.dtype(
+    [
+        ("system_id", "i8"),
+        ("plain", "?"),  # whether kernels may run its usual events: `sim_vehicles.vehicles.plain`
+        ("pushed", "?"),  # whether wind pushes it, too, so that the craft moves it before the kernels' events
+        ("acts_ns", "i8"),  # when it next acts if nothing arrives
+        ("sequence", "i8"),  # number of the next frame
+        ("clock_start_ns", "i8"), ("clock_offset_ns", "i8"), ("clock_drift_ppb", "i8"),  # BootClock
+        # Schedule: the periodic reports in REPORTS, the next of them, and the next message of any other kind
+        ("due_ns", "i8", (3,)), ("due_ms", "i8", (3,)), ("number", "i8", (3,)), ("interval_us", "i8", (3,)),
+        ("report", "i8"), ("report_ns", "i8"),
+        ("other_ns", "i8"),
+        # Authority
+        ("station", "i8"), ("heard_ns", "i8"), ("commanded_ns", "i8"),
+        # FlightMode
+        ("armed", "?"), ("flying", "?"), ("mode", "i8"), ("stopped", "i8"), ("deadline_ns", "i8"),
+        ("setpoint_ns", "i8"), ("setpoint_timeout_ns", "i8"), ("heartbeat_ns", "i8"), ("heartbeat_timeout_ns", "i8"),
+        # the double integrator: its state at a time, its command and its bounds
+        ("state_ns", "i8"), ("north_m", "f8"), ("east_m", "f8"), ("yaw_rad", "f8"), ("speed_m_s", "f8"),
+        ("acceleration_north_m_s2", "f8"), ("acceleration_east_m_s2", "f8"),
+        ("velocity_north_m_s", "f8"), ("velocity_east_m_s", "f8"), ("velocity_gain_1_s", "f8"),
+        ("speed_min_m_s", "f8"), ("speed_max_m_s", "f8"), ("acceleration_max_m_s2", "f8"),
+        ("turn_rate_max_rad_s", "f8"),
+        ("altitude_m", "f8"),
+        # counters, until they are added to those of the vehicle
+        ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"),
+    ],
+    align=True,
+)  # fmt: skip
+REPORTS = HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION
+"""The messages that vehicles report by themselves, in the order in which they are sent at one instant."""
+COUNTED = ("setpoints", "heartbeats", "timesync_requests")
+
+
+class Place(NamedTuple):
+    """Where a vehicle's record is."""
+
+    vehicles: Records
+    columns: Columns
+    """Of `vehicles`."""
+    row: int
+
+
+def new_vehicles(n: int) -> Records:
+    """Records of `VEHICLE` for n vehicles that have done nothing."""
+    vehicles = np.zeros(n, VEHICLE)
+    vehicles["station"] = NOBODY
+    for name in ("acts_ns", "due_ns", "report_ns", "other_ns", "deadline_ns"):
+        vehicles[name] = NEVER_NS
+    return vehicles
+
+
+def place_in(vehicles: Records, row: int = 0) -> Place:
+    """A row of an array of `VEHICLE`."""
+    return Place(vehicles, Columns(vehicles), row)

@@ -1,0 +1,312 @@
+"""The usual events of plain vehicles in one kernel: set-points, heartbeats and TIMESYNC of the station, and reports.
+
+A plain craft is a double integrator whose set-points act at once, and which reports its true state (`Craft.is_plain`).
+If its links are plain, too (`Link.plain`), the kernel runs its events in order of time, as `Shell` does, and stops
+before one that is not usual.
+"""
+
+from math import cos, pi, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.kernel import Record, Records, kernel
+from sim_vehicles.links.links import MOST_ID, row_of
+from sim_vehicles.links.queue import Bytes, copy_bytes, enter, free, new_entry, ready, take, take_in
+from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
+from sim_vehicles.motion.double_integrator import Command, advance_to, set_command
+from sim_vehicles.services.clock import NEVER_NS, boot_ns
+from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M, degrees
+from sim_vehicles.services.frames import (
+    ARDUPILOT,
+    AUTOPILOT,
+    FRAME_BYTES,
+    GLOBAL_POSITION,
+    HEARTBEAT,
+    LOCAL_NED,
+    LOCAL_POSITION,
+    PAYLOAD,
+    SETPOINT,
+    STATION_TYPE,
+    TIMESYNC,
+    Frame,
+    frequent_message,
+    global_position,
+    heartbeat,
+    local_position,
+    read_float,
+    read_int64,
+    read_uint16,
+    timesync,
+)
+from sim_vehicles.services.hot import REPORTS
+from sim_vehicles.services.mavlink import MODE_GUIDED
+from sim_vehicles.services.schedule import schedule_report
+from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, takes_setpoints
+from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
+
+Ints = NDArray[np.int64]
+
+UNUSUAL, MOVE_FIRST, SILENT = -2, -1, 0
+"""In place of the size of a frame to send: nothing has happened, as the event is unusual or the craft must move first;
+or it has happened, and there is no frame."""
+_SETPOINT_BYTES, _HEARTBEAT_BYTES = 53, 9
+"""Whole payloads: those of usual set-points and heartbeats do not end in zeros."""
+
+
+@kernel
+def _must_move(vehicle: Record, time_ns: int) -> bool:
+    """Whether the craft must move to a time before an event there: kernels do not know what pushes it."""
+    return vehicle.pushed and vehicle.flying and time_ns > vehicle.state_ns
+
+
+@kernel
+def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame) -> int:
+    """Act on a datagram that arrives; returns the size of the answer, SILENT, UNUSUAL or MOVE_FIRST."""
+    number = frequent_message(frame, size)
+    if number == SETPOINT:
+        return _take_setpoint(vehicle, frame, time_ns)
+    if number == HEARTBEAT:
+        return _take_heartbeat(vehicle, frame, time_ns)
+    return _answer(vehicle, frame, time_ns, answer) if number == TIMESYNC else UNUSUAL
+
+
+@kernel
+def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int) -> int:
+    """Fly an acceleration that the station commands in flight."""
+    if frame[1] != _SETPOINT_BYTES or frame[5] != vehicle.station or not takes_setpoints(vehicle):
+        return UNUSUAL
+    mask, component = read_uint16(frame, PAYLOAD + 48), frame[PAYLOAD + 51]
+    if mask & (AXES | FORCE_SET) != ACCELERATION or frame[PAYLOAD + 52] != LOCAL_NED:
+        return UNUSUAL
+    if frame[PAYLOAD + 50] != vehicle.system_id or component not in (0, AUTOPILOT):
+        return UNUSUAL
+    north, east, down = (
+        read_float(frame, PAYLOAD + 28),
+        read_float(frame, PAYLOAD + 32),
+        read_float(frame, PAYLOAD + 36),
+    )
+    if not abs(north) + abs(east) + abs(down) <= ABSURD:  # also if NaN
+        return UNUSUAL
+    acts_ns = max(time_ns, vehicle.state_ns)
+    if _must_move(vehicle, acts_ns):
+        return MOVE_FIRST
+    vehicle.heard_ns = vehicle.commanded_ns = time_ns
+    note_setpoint(vehicle, acts_ns)
+    advance_to(vehicle, acts_ns)
+    set_command(vehicle, Command(north, east, 0.0, 0.0, 0.0))
+    vehicle.setpoints += 1
+    return SILENT
+
+
+@kernel
+def _take_heartbeat(vehicle: Record, frame: Frame, time_ns: int) -> int:
+    if frame[1] != _HEARTBEAT_BYTES or frame[5] != vehicle.station or frame[PAYLOAD + 4] != STATION_TYPE:
+        return UNUSUAL
+    vehicle.heard_ns = time_ns
+    note_heartbeat(vehicle, max(time_ns, vehicle.state_ns))
+    vehicle.heartbeats += 1
+    return SILENT
+
+
+@kernel
+def _answer(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
+    """Answer a TIMESYNC request to this vehicle or to all."""
+    size = int(frame[1])
+    target = frame[PAYLOAD + 16] if size > 16 else 0
+    if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0 or target not in (0, vehicle.system_id):
+        return UNUSUAL
+    ts1 = read_int64(frame, PAYLOAD + 8, min(max(size - 8, 0), 8))
+    tc1 = boot_ns(vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb, time_ns)
+    vehicle.timesync_requests += 1
+    return timesync(answer, vehicle, tc1 or 1, ts1)  # never 0, even at boot: that would make the reply a request
+
+
+@kernel
+def report(vehicle: Record, frame: Frame) -> int:
+    """Make the report that is due, before any other event, and schedule the next; returns as `hear`."""
+    k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
+    if REPORTS[k] != HEARTBEAT:
+        if _must_move(vehicle, time_ns):
+            return MOVE_FIRST
+        advance_to(vehicle, time_ns)
+    north, east, yaw = vehicle.north_m, vehicle.east_m, vehicle.yaw_rad
+    if REPORTS[k] == GLOBAL_POSITION and not -pi < yaw < pi:
+        return UNUSUAL
+    schedule_report(vehicle, k, vehicle.number[k] + 1)
+    if REPORTS[k] == HEARTBEAT:
+        mode, critical = vehicle.mode, vehicle.stopped != 0
+        return heartbeat(frame, vehicle, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
+    v_north, v_east = vehicle.speed_m_s * cos(yaw), vehicle.speed_m_s * sin(yaw)
+    if REPORTS[k] == LOCAL_POSITION:
+        return local_position(frame, vehicle, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
+    latitude_deg, longitude_deg = degrees(north, east)
+    altitude_m = ORIGIN_ALTITUDE_M + vehicle.altitude_m
+    return global_position(frame, vehicle, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, yaw)
+
+
+@kernel
+def hear_at(vehicles: Records, row: int, data: Bytes, time_ns: int, frames: Bytes) -> int:
+    """As `hear`; `frames` has room for the datagram and for the answer."""
+    copy_bytes(frames[0], 0, data, 0, len(data))
+    return hear(vehicles[row], frames[0], len(data), time_ns, frames[1])
+
+
+@kernel
+def report_at(vehicles: Records, row: int, frames: Bytes) -> int:
+    """As `report`, into the second of `frames`; also UNUSUAL if another message is due by then."""
+    vehicle = vehicles[row]
+    return report(vehicle, frames[1]) if vehicle.report_ns < vehicle.other_ns else UNUSUAL
+
+
+@kernel
+def run(
+    vehicle: Record, up: Record, down: Record, entries: Records, frames: Bytes, draws: Records, now_ns: int
+) -> bool:
+    """Run a plain vehicle until now; False if it stops before an unusual event. `draws` are those of its up link."""
+    while True:
+        acts_ns = min(vehicle.deadline_ns, vehicle.report_ns, vehicle.other_ns)
+        vehicle.acts_ns = acts_ns
+        time_ns = min(acts_ns, down.next_due_ns)
+        if time_ns > now_ns:
+            return True
+        if not ready(up, entries):
+            return False
+        entry, size = new_entry(entries), UNUSUAL
+        if down.next_due_ns == time_ns:
+            size = hear(vehicle, frames[down.first], entries[down.first].size, time_ns, frames[entry])
+            if size >= SILENT:
+                take(down, entries)
+        elif vehicle.report_ns < min(vehicle.deadline_ns, vehicle.other_ns):
+            size = report(vehicle, frames[entry])
+        if size > SILENT:
+            entries[entry].size = size
+            enter(up, entries, frames, draws, entry, time_ns)
+        else:
+            free(entries, entry)
+        if size < SILENT:
+            return False
+
+
+@kernel
+def leaves_ns(vehicle: Record, up: Record, down: Record) -> int:
+    """The earliest instant at which a datagram of the vehicle can leave its up link."""
+    acts_ns = min(vehicle.acts_ns, down.next_due_ns)
+    if acts_ns <= NEVER_NS - up.least_delay_ns:
+        acts_ns += up.least_delay_ns
+    return min(acts_ns, up.next_due_ns)
+
+
+@kernel
+def _enter_all(
+    links: Records, entries: Records, frames: Bytes, draws: Records, data: Bytes, received: Ints, first: int
+) -> int:
+    """Let datagrams enter their down links, from the first one on; returns the first that cannot, or their number.
+
+    `received` holds system id, size and time of each, one after the other, and `data` their bytes.
+    """
+    begin, count = 0, len(received) // 3
+    for k in range(first):
+        begin += received[3 * k + 1]
+    for k in range(first, count):
+        system_id, size, time_ns = received[3 * k], received[3 * k + 1], received[3 * k + 2]
+        if not 0 <= system_id <= MOST_ID:
+            return k
+        row = row_of(system_id, LINK_DOWN)
+        link = links[row]
+        if not link.plain or size > FRAME_BYTES or not ready(link, entries):
+            return k
+        enter(link, entries, frames, draws[row], take_in(entries, frames, data, begin, size), time_ns)
+        begin += size
+    return count
+
+
+@kernel
+def run_at(
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, row: int, now_ns: int
+) -> bool:
+    """Run the plain vehicle in a row until now; False if it stops before an unusual event."""
+    vehicle = vehicles[row]
+    up, down = row_of(vehicle.system_id, LINK_UP), row_of(vehicle.system_id, LINK_DOWN)
+    return run(vehicle, links[up], links[down], entries, frames, draws[up], now_ns)
+
+
+@kernel
+def _run_all(
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, waiting: Ints, now_ns: int
+) -> int:
+    """Run the plain vehicles of which a datagram can leave by now until now.
+
+    Returns how many others wait; these are in `waiting`, as (when their next datagram can leave, row).
+    """
+    count = 0
+    for row in range(len(vehicles)):
+        vehicle = vehicles[row]
+        up, down = row_of(vehicle.system_id, LINK_UP), row_of(vehicle.system_id, LINK_DOWN)
+        first_ns = leaves_ns(vehicle, links[up], links[down])
+        if first_ns > now_ns:
+            continue
+        if not vehicle.plain or not run_at(vehicles, links, entries, frames, draws, row, now_ns):
+            waiting[count, 0], waiting[count, 1] = first_ns, row
+            count += 1
+    return count
+
+
+@kernel
+def leave_all(
+    vehicles: Records,
+    links: Records,
+    entries: Records,
+    frames: Bytes,
+    leaving: Ints,
+    data: Bytes,
+    now_ns: int,
+) -> int:
+    """Take datagrams that leave their up links by now; returns how many, at most as many as `leaving` has rows.
+
+    `leaving` is (system id, begin, end, time) of each, and `data` holds their bytes.
+    """
+    count = end = 0
+    for row in range(len(vehicles)):
+        system_id = vehicles[row].system_id
+        link = links[row_of(system_id, LINK_UP)]
+        while link.next_due_ns <= now_ns and link.under_way > 0:
+            if count == len(leaving):
+                return count
+            entry = take(link, entries)
+            begin, end = end, end + entries[entry].size
+            copy_bytes(data, begin, frames[entry], 0, entries[entry].size)
+            leaving[count, 0], leaving[count, 1], leaving[count, 2] = system_id, begin, end
+            leaving[count, 3] = entries[entry].due_ns
+            count += 1
+    return count
+
+
+@kernel
+def next_leaving_ns(vehicles: Records, links: Records) -> int:
+    """The earliest instant at which a datagram of any vehicle can leave."""
+    first_ns = NEVER_NS
+    for row in range(len(vehicles)):
+        system_id = vehicles[row].system_id
+        up, down = links[row_of(system_id, LINK_UP)], links[row_of(system_id, LINK_DOWN)]
+        first_ns = min(first_ns, leaves_ns(vehicles[row], up, down))
+    return first_ns
+
+
+@kernel
+def step_all(
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records,
+    data: Bytes, received: Ints, waiting: Ints, leaving: Ints, leaving_data: Bytes, first: int, now_ns: int,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Let datagrams enter, from the first one on, run the vehicles until now, and take what leaves by then.
+
+    Returns the results of `_enter_all`, `_run_all` and `leave_all`. If not all could enter, nothing else is done yet;
+    if vehicles wait, nothing leaves yet.
+    """
+    entered = _enter_all(links, entries, frames, draws, data, received, first)
+    if 3 * entered < len(received):
+        return entered, 0, 0
+    waits = _run_all(vehicles, links, entries, frames, draws, waiting, now_ns)
+    if waits:
+        return entered, waits, 0
+    return entered, 0, leave_all(vehicles, links, entries, frames, leaving, leaving_data, now_ns)
