@@ -16,18 +16,6 @@ VENV = ROOT / ".venv"
 STAMP = VENV / "installed.sha256"
 LOCK = ROOT / "requirements.lock"
 
-# The hot path of a flight in virtual time, and of the station: these modules can be compiled.
-COMPILED = (
-    "gcs/control/history.py gcs/control/law.py gcs/control/limits.py gcs/control/loop_delay.py "
-    "gcs/control/loops.py gcs/control/phases.py gcs/drive/guard.py gcs/drive/lockstep.py gcs/link/clocks.py "
-    "gcs/link/mavlink.py gcs/link/sequence.py gcs/link/vehicle.py gcs/station/monitor.py gcs/station/station.py "
-    "gcs/station/tick_rows.py scenarios/signing/link.py scenarios/signing/stamps.py sim_vehicles/drive/fleet.py "
-    "sim_vehicles/links/links.py sim_vehicles/services/clock.py "
-    "sim_vehicles/services/mavlink.py sim_vehicles/services/schedule.py "
-    "sim_vehicles/vehicles/double_integrator.py sim_vehicles/motion/double_integrator.py "
-    "sim_vehicles/vehicles/flight_mode.py sim_vehicles/vehicles/setpoints.py sim_vehicles/vehicles/shell.py"
-)
-
 # name: (what it is for, the commands; further arguments go to the last one)
 JOBS: dict[str, tuple[str, list[str]]] = {
     "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
@@ -48,10 +36,6 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     "lint": (
         "check format, style, types and import contracts",
         ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],
-    ),
-    "compile": (
-        "compile the hot path (needs a C compiler): a quarter to a half faster; undone when a source changes",
-        [f"mypyc {COMPILED}"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
     "pictures": (
@@ -94,22 +78,10 @@ def install() -> None:
     pip = [str(python), "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
     subprocess.run([*pip, "--require-hashes", "-r", str(LOCK)], check=True)
     subprocess.run([*pip, "--no-deps", "--no-build-isolation", "--editable", str(ROOT)], check=True)
+    print("compiling what runs for every frame (half a minute; kept in ~/.cache/formation-gcs)", flush=True)
+    flight = [str(VENV / "bin" / "gcs"), "bench", "chain3", "--seconds", "1", "--repeat", "1"]
+    subprocess.run(flight, check=True, stdout=subprocess.DEVNULL, cwd=VENV)
     STAMP.write_text(wanted)
-
-
-def drop_stale() -> None:
-    """Remove what was compiled from sources that have changed since: Python would run it in their place."""
-    compiled = [
-        file
-        for folder in (".", *{str(Path(source).parent) for source in COMPILED.split()})
-        for file in (ROOT / folder).glob("*.so")
-    ]
-    newest = max((ROOT / source).stat().st_mtime for source in COMPILED.split())
-    # the newest of them is the library that all share; the others are written when they change
-    if compiled and max(file.stat().st_mtime for file in compiled) < newest:
-        print("sources have changed: compiled modules removed", flush=True)
-        for file in compiled:
-            file.unlink()
 
 
 def main() -> None:
@@ -125,7 +97,6 @@ def main() -> None:
     except subprocess.CalledProcessError as error:
         sys.exit(f"installation failed: {' '.join(error.cmd)}")
     os.chdir(ROOT)
-    drop_stale()
     *first, last = [[str(VENV / "bin" / line.split()[0]), *line.split()[1:]] for line in JOBS[chosen.job][1]]
     for command in first:
         status = subprocess.run(command, check=False).returncode

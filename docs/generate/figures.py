@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from docs.generate.blocks import ROOT, table
-from docs.generate.runner import CommandError, Runner
+from docs.generate.runner import Runner
 from docs.generate.sessions import steps_of
 
 
@@ -424,21 +424,11 @@ def capacity(runner: Runner) -> str:
     return table(("telemetry and control", "vehicles carried", "loop delay p50 / p99", "what ends it"), rows)
 
 
-def _speed(runner: Runner, *, compiled: bool) -> str:
+def speed(runner: Runner) -> str:
     rows: list[tuple[str, ...]] = []
     for options in ("", " --vehicles 250 --seconds 2 --repeat 3"):
         found = runner.json(f"gcs bench scenarios/triangle5.toml{options}")
-        if found["compiled"] != compiled:
-            raise CommandError(f"the hot path is {'not ' if compiled else ''}compiled: python3 make.py compile")
         times = _range((found["real_time_factor_p50"], found["real_time_factor"]), ".3g", " times")
         rows.append((f"{found['vehicles']}", times, f"{1e3 * found['station_s_per_tick']:.2f} ms"))
     head = ("vehicles, 50 Hz", "faster than real time, one core (median to best)", "station, of its period of 20 ms")
     return table(head, rows)
-
-
-def speed(runner: Runner) -> str:
-    return _speed(runner, compiled=False)
-
-
-def speed_compiled(runner: Runner) -> str:
-    return _speed(runner, compiled=True)

@@ -12,10 +12,9 @@ from docs.generate.runner import CommandError, Runner, measured_on, runner
 from docs.generate.side_by_side import cluster, peers, tick_ratio
 from docs.generate.stages import stages
 
-Kind = Literal["quick", "exact", "slow", "timed", "compiled"]
+Kind = Literal["quick", "exact", "slow", "timed"]
 """Figures that are the same on every machine are `quick`, compared by the tests, `exact`, compared by CI, or `slow`,
-compared only if they are named. `timed` ones are measured in real time; so are `compiled` ones, with the hot path
-compiled.
+compared only if they are named. `timed` ones are measured in real time.
 """
 
 
@@ -43,7 +42,6 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
         *(figures.signing, figures.design_time, figures.speed, figures.onset_real_time, tick_ratio, peers, cluster),
         *(stages, certificates),
     ),
-    "compiled": (figures.speed_compiled,),
 }
 
 FIGURES = {make.__name__.replace("_", "-"): Figure(make, kind) for kind, makers in _MAKERS.items() for make in makers}

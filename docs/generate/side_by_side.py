@@ -30,8 +30,7 @@ def tick_ratio(runner: Runner) -> str:
     found = runner.json("gcs bench scenarios/triangle5.toml --vehicles 250 --seconds 2 --repeat 3")
     return (
         f"A whole station tick of {found['vehicles']} vehicles takes **{found['tick_over_parse']:.1f} times** as long "
-        "as pymavlink takes to parse their LOCAL_POSITION_NED alone, "
-        f"{'compiled' if found['compiled'] else 'interpreted'}."
+        "as pymavlink takes to parse their LOCAL_POSITION_NED alone."
     )
 
 
