@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Never
 
 if TYPE_CHECKING:
     from scenarios.schema import Scenario
-    from sim_vehicles.drive.fleet import Fleet, prepare
+    from sim_vehicles.drive.fleet import Fleet
     from sim_vehicles.drive.udp import Sockets
     from sim_vehicles.links.truth import TruthLog
     from sim_vehicles.vehicles.shell import Change
@@ -94,7 +94,7 @@ def _fly(
     options: argparse.Namespace,
     opened: contextlib.ExitStack,
 ) -> None:
-    from sim_vehicles.drive.fleet import Fleet
+    from sim_vehicles.drive.fleet import Fleet, prepare
     from sim_vehicles.drive.guard import open_links
     from sim_vehicles.drive.udp import Ports, run
 
