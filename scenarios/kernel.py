@@ -89,10 +89,10 @@ def any_kept() -> bool:
 
 def _cache(wanted: str) -> Path | None:
     """Where compiled kernels are kept; None if nothing can be."""
-    folder = Path(wanted or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "formation-gcs"
     try:
+        folder = Path(wanted or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "formation-gcs"
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: nobody's home
         return None
     return folder if os.access(folder, os.W_OK) else None
 

@@ -233,10 +233,9 @@ class Reception:
 
     def _follow_up(self, outgoing: list[Outgoing]) -> None:
         """Do what the kernels have left to do."""
-        count_ = self._tables.news_count
-        if not count_[0]:
-            return
-        for kind, row, value_ns, sent_ns, delivered_ns in self._tables.news[: count_[0]].tolist():
+        news = self._tables.news[: self._tables.news_count[0]].tolist()
+        self._tables.news_count[0] = 0
+        for kind, row, value_ns, sent_ns, delivered_ns in news:
             vehicle = self._fleet.vehicles[row]
             if kind == _ORDER:
                 vehicle.report_order(value_ns)
@@ -249,7 +248,6 @@ class Reception:
                 self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
             else:
                 vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=value_ns), outgoing)
-        count_[0] = 0
 
 
 @kernel
