@@ -426,7 +426,7 @@ def capacity(runner: Runner) -> str:
 
 def speed(runner: Runner) -> str:
     rows: list[tuple[str, ...]] = []
-    for options in ("", " --vehicles 250 --seconds 2 --repeat 3"):
+    for options in ("", " --vehicles 250"):
         found = runner.json(f"gcs bench scenarios/triangle5.toml{options}")
         times = _range((found["real_time_factor_p50"], found["real_time_factor"]), ".3g", " times")
         rows.append((f"{found['vehicles']}", times, f"{1e3 * found['station_s_per_tick']:.2f} ms"))

@@ -27,7 +27,7 @@ def peers(runner: Runner) -> str:
 
 def tick_ratio(runner: Runner) -> str:
     """One ratio that says on any machine how fast the station is."""
-    found = runner.json("gcs bench scenarios/triangle5.toml --vehicles 250 --seconds 2 --repeat 3")
+    found = runner.json("gcs bench scenarios/triangle5.toml --vehicles 250")
     return (
         f"A whole station tick of {found['vehicles']} vehicles takes **{found['tick_over_parse']:.1f} times** as long "
         "as pymavlink takes to parse their LOCAL_POSITION_NED alone."

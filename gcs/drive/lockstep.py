@@ -7,7 +7,7 @@ a socket; the station decides nothing in between.
 
 import gc
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Protocol
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
-from gcs.link.datagram import Datagram
+from gcs.link.datagram import Arrival, Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
 from scenarios.keys.link import Links
@@ -153,9 +153,10 @@ def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard 
     while station.phase is not Phase.ENDED:
         now_ns = station.next_event_ns
         arrived = vehicles.step(to_vehicles, now_ns)
-        datagrams = [Datagram(data, addresses[system_id], time_ns) for system_id, data, time_ns in arrived]
+        datagrams: Sequence[Arrival] = [(data, addresses[key], time_ns, 0) for key, data, time_ns in arrived]
         if guard is not None:
-            datagrams = guard.received(datagrams, now_ns, station.counters, station.is_another)
+            whole = [Datagram(*each) for each in datagrams]
+            datagrams = guard.received(whole, now_ns, station.counters, station.is_another)
         outgoing, tick = station.step(datagrams, now_ns)
         if guard is not None:
             outgoing = guard.sent(outgoing, now_ns)

@@ -4,6 +4,7 @@ Nearly all datagrams hold one LOCAL_POSITION_NED, or the reply to a TIMESYNC req
 to the first datagram that is anything else; that one is read frame by frame, by the same kernels where they apply.
 """
 
+from array import array
 from collections import Counter, defaultdict, deque
 from collections.abc import Sequence
 from itertools import accumulate
@@ -18,7 +19,7 @@ from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
 from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Arrival, Datagram, Outgoing
 from gcs.link.mavlink import TIMESYNC, float_at, unsigned_at, usual_message
 from gcs.link.sequence import DUPLICATE, NEW, count
 from gcs.link.vehicle import RemoteVehicle, Report, delivery_ns
@@ -134,7 +135,7 @@ class Reception:
         row = self._row.get(system_id)
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
-    def take(self, datagrams: Sequence[Datagram], now_ns: int) -> list[Outgoing]:
+    def take(self, datagrams: Sequence[Arrival], now_ns: int) -> list[Outgoing]:
         """Take datagrams in; returns the answers to them."""
         outgoing: list[Outgoing] = []
         if not datagrams:
@@ -150,12 +151,13 @@ class Reception:
             if len(numbers) != known:  # at first, and when a vehicle has sent from another address
                 known = len(numbers)
                 senders = [numbers.get(address, _NOT_KNOWN) for address in addresses]
-                table = np.array([*accumulate(map(len, data)), *senders, *received_ns, *queued_ns], np.int64)
+                numbers_of = array("q", [*accumulate(map(len, data)), *senders, *received_ns, *queued_ns])
+                table = np.frombuffer(numbers_of, np.int64)
             stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, now)
             self.frames += zip(data[place:stop], received_ns[place:stop], strict=True)
             self._follow_up(outgoing)
             if stop < len(datagrams):
-                self._take(datagrams[stop], now, outgoing)
+                self._take(Datagram(*datagrams[stop]), now, outgoing)
             place = stop + 1
         return outgoing
 

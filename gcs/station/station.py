@@ -19,7 +19,7 @@ from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Arrival, Outgoing
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import SILENCE_S, RemoteVehicle, requests_to
 from gcs.plan.flight_plan import FlightPlan
@@ -112,7 +112,7 @@ class Station:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._journal.request_stop(reason)
 
-    def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
+    def step(self, datagrams: Sequence[Arrival], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
         """Take datagrams in and do what is due.
 
         Returns
