@@ -15,6 +15,7 @@ import numpy as np
 from scenarios import schema
 from scenarios.files import fingerprint
 from scenarios.kernel import Columns, Records
+from scenarios.keys.link import Links
 from scenarios.schema import NS_PER_S
 from scenarios.signing.link import SignedLink
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
@@ -25,6 +26,7 @@ from sim_vehicles.motion.sector import SectorBound
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.hot import Place, new_vehicles
+from sim_vehicles.services.mavlink import rehearsal
 from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
@@ -307,5 +309,12 @@ class Fleet:
 
 
 def prepare(scenario: schema.Scenario) -> None:
-    """Run plain vehicles of a scenario for a second, so that nothing of them needs to be compiled in real time."""
-    Fleet(scenario.model_copy(update={"dynamics": "double_integrator"}), 0).step((), NS_PER_S)
+    """Fly plain vehicles of a scenario for seconds, logged and not, so that nothing is compiled in real time."""
+    plain = {"dynamics": "double_integrator", "links": Links()}
+    log = list[object]()
+    for record in (None, log.append):
+        fleet = Fleet(scenario.model_copy(update=plain), 0, record=record)
+        for tenth, frames in enumerate(zip(*map(rehearsal, fleet.system_ids), strict=True)):
+            now_ns = tenth * NS_PER_S // 10
+            fleet.step([(key, data, now_ns) for key, data in zip(fleet.system_ids, frames, strict=True)], now_ns)
+        fleet.step((), 3 * NS_PER_S)

@@ -325,3 +325,21 @@ class Encoder:
         frame = message.pack(self._pymavlink)
         self.sequence = (self.sequence + 1) & 0xFF
         return frame
+
+
+def rehearsal(system_id: int) -> list[bytes]:
+    """Frames with which a station brings a vehicle into flight and commands it."""
+    station = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+    none = 0.0
+    messages = (
+        dialect.MAVLink_heartbeat_message(TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3),
+        dialect.MAVLink_timesync_message(0, 1),
+        dialect.MAVLink_command_long_message(
+            system_id, 1, COMMAND_MODE, 0, BASE_MODE_CUSTOM, MODE_GUIDED, none, none, none, none, none
+        ),
+        dialect.MAVLink_command_long_message(system_id, 1, COMMAND_ARM, 0, 1.0, none, none, none, none, none, none),
+    )
+    set_point: Any = dialect.MAVLink_set_position_target_local_ned_message
+    zeros = (none,) * 6
+    flown = [set_point(ms, system_id, 1, FRAME_LOCAL_NED, 0x0C3F, *zeros, 0.5, -0.5, none, none, none) for ms in (1, 2)]
+    return [message.pack(station) for message in (*messages, *flown)]
