@@ -92,7 +92,7 @@ def _cache(wanted: str) -> Path | None:
     try:
         folder = Path(wanted or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "formation-gcs"
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):  # RuntimeError: nobody's home
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return None
     return folder if os.access(folder, os.W_OK) else None
 

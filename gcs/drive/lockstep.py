@@ -104,7 +104,7 @@ def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
 
 @dataclass
 class _Joining:
-    """Vehicles that send what the station gets at once from one of them as one datagram, as real ones may."""
+    """Vehicles of which each packs all its frames of a step into one datagram, as real ones may."""
 
     vehicles: Vehicles
 

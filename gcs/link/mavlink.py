@@ -263,7 +263,7 @@ SET_POINT = np.dtype(
     [("sent", "?"), ("type_mask", "u2"), ("velocity_ned_m_s", "f8", (3,)), ("acceleration_ne_m_s2", "f8", (2,))]
 )
 """What a vehicle is sent as SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED; `sent`: whether it is sent one."""
-POSITION_BYTES, TIMESYNC_BYTES = _LAYOUTS[LOCAL_POSITION_NED].length, _LAYOUTS[TIMESYNC].length
+_TIMESYNC_BYTES = _LAYOUTS[TIMESYNC].length
 _SET_POINT_BYTES = _LAYOUTS[SET_POSITION_TARGET_LOCAL_NED].length
 _HEADER_BYTES = _HEADER.size
 _POSITION_EXTRA, _TIMESYNC_EXTRA = CRC_EXTRA[LOCAL_POSITION_NED][0], CRC_EXTRA[TIMESYNC][0]
@@ -376,7 +376,7 @@ def _encode_set_points(
         _encode_set_point(frames[place], points, row, key_ms, system_ids[row], sequences[row])
 
 
-REQUEST_FRAME_BYTES = _OVERHEAD + TIMESYNC_BYTES
+REQUEST_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES
 
 
 @kernel

@@ -22,7 +22,7 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
 
 
 PILOTED = (TAKEN_OVER, STAYS_DISARMED)
-"""Reasons that are a pilot's, or were."""
+"""Why a vehicle is absent that its pilot flies or has landed."""
 
 
 def describe_change(was: str, now: str) -> str:

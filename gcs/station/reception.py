@@ -151,8 +151,8 @@ class Reception:
             if len(numbers) != known:  # at first, and when a vehicle has sent from another address
                 known = len(numbers)
                 senders = [numbers.get(address, _NOT_KNOWN) for address in addresses]
-                numbers_of = array("q", [*accumulate(map(len, data)), *senders, *received_ns, *queued_ns])
-                table = np.frombuffer(numbers_of, np.int64)
+                columns = array("q", [*accumulate(map(len, data)), *senders, *received_ns, *queued_ns])
+                table = np.frombuffer(columns, np.int64)
             stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, now)
             self.frames += zip(data[place:stop], received_ns[place:stop], strict=True)
             self._follow_up(outgoing)
