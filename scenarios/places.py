@@ -77,6 +77,7 @@ _WANTED = {
     "model_type": "a table of keys",
     "model_attributes_type": "a table of keys",
     "dict_type": "a table of keys",
+    "system_id": "at most 250, or 1001 to 1250 in network 1, 2001 to 2250 in network 2, and so on",
     "dynamics": "double_integrator, autopilot, jsbsim, jsbsim:MODEL, or FILE.py:NAME",
     "prediction": "off, measured, or a number of seconds greater than 0, at most {most:g}",
 }

@@ -33,6 +33,7 @@ from scenarios.keys.part import (
     Velocity,
 )
 from scenarios.keys.rates import Rates
+from scenarios.networks import MOST_VEHICLES
 from scenarios.smooth import Bounds, SmoothCourse, course_by_steps, course_by_waypoints
 
 NS_PER_S = 1_000_000_000
@@ -44,7 +45,8 @@ class Vehicle(Part):
     """One UAV: whom it follows, where it flies relative to that vehicle, and its state when the flight begins."""
 
     system_id: SystemId
-    """MAVLink system id, different for each vehicle."""
+    """MAVLink system id, 1 to 250, different for each vehicle. A vehicle of another network than 0 has 1000 times the
+    number of the network (1 to 9) added: 2017 is system 17 of network 2, which has a UDP port of its own."""
     follows: SystemId | None = None
     """System id of the vehicle in front. Exactly one vehicle, the leader, omits it."""
     offset_ne_m: Position | None = None
@@ -301,7 +303,7 @@ class Scenario(Part):
     """How long the formation is flown."""
     altitude_m: NotNegative = 1000.0
     """Altitude above the origin of every vehicle that has none of its own."""
-    vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=250)]
+    vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=MOST_VEHICLES)]
     """The formation: one tree, whose root is the leader."""
     nominal_velocity: tuple[NominalVelocity, ...] = ()
     """The formation's velocity over time, as steps in order of time; needed without `course.waypoints_ne_m`."""

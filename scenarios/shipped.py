@@ -1,6 +1,9 @@
 """The scenarios that ship with the package, by name, and new ones: a copy of one of these, or columns of vehicles."""
 
+from collections.abc import Sequence
 from pathlib import Path
+
+from scenarios.networks import ids_of
 
 FOLDER = Path(__file__).parent
 PROFILES = FOLDER / "profiles"
@@ -46,7 +49,8 @@ def columns(new_name: str, count: int, length: int) -> str:
     shape = f"A chain of {length}: each vehicle follows the one in front of it."
     if count > 1:
         shape = f"{count} columns of {length}: the heads of the columns follow the head to their left."
-    vehicles = "\n".join(_vehicle(k, length, alone=count == 1) for k in range(count * length))
+    ids = ids_of(count * length)
+    vehicles = "\n".join(_vehicle(ids, k, length, alone=count == 1) for k in range(len(ids)))
     return f"""\
 {_SCHEMA_LINE}
 # {shape}
@@ -75,19 +79,19 @@ down = {{ delay_s = 0.02 }}  # set-points, one way
 """
 
 
-def _vehicle(k: int, length: int, *, alone: bool) -> str:
+def _vehicle(ids: Sequence[int], k: int, length: int, *, alone: bool) -> str:
     column, rank = divmod(k, length)
     aside = rank * _ASIDE_M if alone else column * _ASIDE_M
     north_m, east_m = -_SPACING_M * rank, aside
     if k == 0:
         return f"    {{ system_id = 1, position_ne_m = [0, 0], velocity_ne_m_s = [{_SPEED_M_S:g}, 0] }},"
     if rank:
-        follows, offset = k, (-_SPACING_M, _ASIDE_M if alone else 0.0)
+        follows, offset = ids[k - 1], (-_SPACING_M, _ASIDE_M if alone else 0.0)
     else:
-        follows, offset = k + 1 - length, (0.0, _ASIDE_M)
+        follows, offset = ids[k - length], (0.0, _ASIDE_M)
     wrong_north_m, wrong_east_m = _ERRORS_M[k % len(_ERRORS_M)]
     return (
-        f"    {{ system_id = {k + 1}, follows = {follows}, offset_ne_m = [{offset[0]:g}, {offset[1]:g}], "
+        f"    {{ system_id = {ids[k]}, follows = {follows}, offset_ne_m = [{offset[0]:g}, {offset[1]:g}], "
         f"position_ne_m = [{north_m + wrong_north_m:g}, {east_m + wrong_east_m:g}], "
         f"velocity_ne_m_s = [{_SPEED_M_S:g}, 0] }},"
     )

@@ -13,6 +13,7 @@ from gcs.cli import FAILED, INTERRUPTED, options
 from gcs.cli.front import LinksOf, chosen_for, chosen_now, with_link
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+from scenarios.networks import networks_of
 
 if TYPE_CHECKING:
     from gcs.runs.summary_record import Summary
@@ -91,13 +92,11 @@ def fly(
         link = to = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
         if not virtual:
-            link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station")))
+            networks = networks_of(vehicle.system_id for vehicle in scenario.vehicles)
+            guard = options.opened_guard(key, role="station")
+            link = opened.enter_context(options.listening(*at, guard, networks))
             options.warn_if_open(link)
-            to = (
-                None
-                if mirror is None
-                else opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
-            )
+            to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands)) if mirror else None
         unmeasured = links_of is None and scenario.control.for_link == "measured"
         there = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
         scenario, measured = (

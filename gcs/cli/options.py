@@ -186,13 +186,14 @@ def address(option: str, text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def listening(option: str, text: str, guard: "Guard | None" = None) -> "StationSocket":
-    """A socket that listens at the HOST:PORT given to an option; with a guard, its frames are signed and verified."""
+def listening(option: str, text: str, guard: "Guard | None" = None, networks: Sequence[int] = (0,)) -> "StationSocket":
+    """The socket that listens to networks at the HOST:PORT given to an option, see `StationSocket`."""
     from gcs.drive.udp import StationSocket
 
     host, port = address(option, text)
-    with usable(f"{option}: {text}", "a free UDP port of this machine"):
-        return StationSocket(host, port, guard)
+    ports = "a free UDP port" if len(networks) == 1 else f"free UDP ports, the one given plus {networks}"
+    with usable(f"{option}: {text}", f"{ports} of this machine"):
+        return StationSocket(host, port, guard, networks)
 
 
 def warn_if_open(link: "StationSocket") -> None:
@@ -220,6 +221,9 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
     host, port = address("--mirror", text)
     if port == 0:
         raise InputError(f"--mirror: read {text}, wanted the port of a ground station")
+    if len(link.networks) > 1:
+        wanted = "wanted one: another station knows vehicles by their ids in frames"
+        raise InputError(f"--mirror: read vehicles in the networks {' '.join(map(str, link.networks))}, {wanted}")
     with usable(f"--mirror: {text}", "the address of a ground station"):
         mirror = Mirror(host, port, commands=commands, signed=link.guard and link.guard.mirror_link)
     (to_host, to_port), (own_host, own_port) = mirror.address, link.address

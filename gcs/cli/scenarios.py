@@ -10,14 +10,13 @@ from gcs.cli import front as fronts
 from gcs.cli import options
 from gcs.cli.front import chosen_for, with_link
 from gcs.errors import InputError
+from scenarios.networks import MOST_VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from gcs.drive.check import CourseCheck, PlannedMotionCheck, ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
-
-MOST_VEHICLES = 250
 
 
 def scenarios(

@@ -10,6 +10,7 @@ import typer
 from gcs.cli import FAILED, options
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+from scenarios.networks import MOST_VEHICLES
 
 _SLOWEST_HZ, _FASTEST_HZ = 1.0, 500.0
 """Bounds of `rates.control_hz`."""
@@ -81,7 +82,7 @@ def thesis(
 def bench(
     scenario_file: options.ScenarioFile = Path("triangle5"),
     vehicles: Annotated[
-        int, typer.Option(metavar="N", min=0, max=250, help="number of vehicles, in columns behind a leader")
+        int, typer.Option(metavar="N", min=0, max=MOST_VEHICLES, help="number of vehicles, in columns behind a leader")
     ] = 0,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="duration of each flight")] = 8.0,
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="number of flights; the fastest counts")] = 10,
@@ -152,7 +153,7 @@ def bench(
 def capacity(
     scenario_file: options.ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
-    most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
+    most: Annotated[int, typer.Option(metavar="N", min=2, max=MOST_VEHICLES, help="largest formation tried")] = 100,
     seeds: Annotated[
         int, typer.Option(metavar="N", min=1, help="flights of each formation, all of which must succeed")
     ] = 3,

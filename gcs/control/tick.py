@@ -64,7 +64,7 @@ TICK = np.dtype(
         ("due_ns", "<i8"),  # when the tick was due, station clock
         ("sent_ns", "<i8"),  # when the vehicle's set-point, or else the tick's last datagram, was with the kernel
         ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
-        ("system_id", "u1"),  # the vehicle that the row is about
+        ("system_id", "<u2"),  # the vehicle that the row is about
         ("mode", "u1"),  # its mode, as a number
         ("gain_set", "u1"),  # place in the gain schedule, 0 the fastest
         ("commanded", "?"),  # a set-point was sent to this vehicle

@@ -23,6 +23,7 @@ from gcs.runs.files import RunTail, read_ticks, write_experiment
 from gcs.runs.grade import Truth, read_truth, truth_of
 from gcs.runs.record import END, EVENTS_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
 from gcs.station.station import Station
+from scenarios.networks import networks_of
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7
 """Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
@@ -100,7 +101,8 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
     folder.mkdir(parents=True, exist_ok=True)
     try:
         before = _processor_times()
-        with StationSocket("127.0.0.1", 0) as link:
+        networks = networks_of(plan.formation.system_ids)
+        with StationSocket("127.0.0.1", 0, networks=networks) as link:
             summary = fly(plan, design, link, folder, show_table=False)
         needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
         if lost := [text for text in summary.not_logged if text.startswith(needed)]:

@@ -117,7 +117,7 @@ def fly_in_virtual_time(
             for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
                 writer.tick(rows)
                 frames = sorted(station.frames + vehicles.take_sent(), key=itemgetter(1))
-                writer.frames((frame, EPOCH_NS + time_ns) for frame, time_ns in frames)
+                writer.frames(frames, EPOCH_NS)
                 for event in station.events:
                     writer.event(event)
                 station.events.clear()

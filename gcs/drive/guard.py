@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from gcs.link import mavlink
@@ -19,10 +20,15 @@ class Guard:
     """Signs what the station sends; verifies what it receives and removes the signatures."""
 
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
-        self._link, self.mirror_link = (
-            SignedLink(key, link_id=link_id, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
-            for link_id in (LINK_ID, MIRROR_LINK_ID)
-        )
+        self._end = partial(SignedLink, key, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
+        self._links: dict[int, SignedLink] = {}
+        """The ends of the links to the networks that were heard or sent to."""
+        self.mirror_link = self._end(link_id=MIRROR_LINK_ID)
+
+    def _link(self, network: int) -> SignedLink:
+        if network not in self._links:
+            self._links[network] = self._end(link_id=LINK_ID, owner=network)
+        return self._links[network]
 
     def received(
         self,
@@ -41,13 +47,13 @@ class Guard:
             def unwanted(system_id: int, datagram: Datagram = datagram) -> str:
                 return ANOTHER_ADDRESS if is_another is not None and is_another(system_id, datagram) else ""
 
-            good = self._link.verify(datagram.data, now_ns, refused, unwanted)
+            good = self._link(datagram.address[2]).verify(datagram.data, now_ns, refused, unwanted)
             if good:
                 verified.append(Datagram(good, *datagram[1:]))
         return verified
 
     def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
-        return [(self._link.sign(data, now_ns), address) for data, address in outgoing]
+        return [(self._link(address[2]).sign(data, now_ns), address) for data, address in outgoing]
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:

@@ -16,10 +16,11 @@ from typing import Protocol
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
-from gcs.link.datagram import Arrival, Datagram
+from gcs.link.datagram import Arrival, Datagram, Logged
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
 from scenarios.keys.link import Links
+from scenarios.networks import network_of
 from scenarios.schema import Scenario
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
@@ -75,14 +76,14 @@ class RecordedVehicles:
     def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
         self._truth = TruthLog(truth_file)
         self._vehicles = vehicles_of(plan.scenario, record=self._record)
-        self._sent: list[tuple[bytes, int]] = []
+        self._sent: list[Logged] = []
 
     def step(self, received: Sent, now_ns: int) -> Sent:
-        self._sent += [(data, time_ns) for _, data, time_ns in received]
+        self._sent += [(data, time_ns, (_HOST, key, network_of(key))) for key, data, time_ns in received]
         return self._vehicles.step(received, now_ns)
 
-    def take_sent(self) -> list[tuple[bytes, int]]:
-        """The frames that the station sent since the last call, with their times in ns."""
+    def take_sent(self) -> list[Logged]:
+        """The frames that the station sent since the last call."""
         sent, self._sent = self._sent, []
         return sent
 
@@ -134,7 +135,7 @@ def fly_lockstep(
     """Fly a plan in virtual time; yields the rows (a fresh copy) of each control tick.
 
     Pass a station to read its events and end reason afterwards, vehicles to continue an earlier flight, and a guard to
-    sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id).
+    sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id, its network).
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan.scenario)
@@ -148,7 +149,7 @@ def fly_lockstep(
 
 
 def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:
-    addresses = {system_id: (_HOST, system_id) for system_id in plan.formation.system_ids}
+    addresses = {key: (_HOST, key, network_of(key)) for key in plan.formation.system_ids}
     to_vehicles: Sent = []
     while station.phase is not Phase.ENDED:
         now_ns = station.next_event_ns
@@ -160,7 +161,7 @@ def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard 
         outgoing, tick = station.step(datagrams, now_ns)
         if guard is not None:
             outgoing = guard.sent(outgoing, now_ns)
-        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
+        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id, _) in outgoing]
         if tick is not None:
             yield station.complete(tick, [now_ns] * len(outgoing))
             station.frames.clear()

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Self
 
 from gcs.link import mavlink
-from gcs.link.datagram import Address, Outgoing
+from gcs.link.datagram import Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.vehicle import RemoteVehicle
 from scenarios.signing.link import SignedLink
@@ -25,6 +25,8 @@ _DATAGRAMS_A_STEP = 64
 
 class Mirror:
     """A socket connected to another ground station; with `commands`, its frames are passed on to the vehicles.
+
+    All vehicles are of one network, as the other station knows them by their ids in frames.
 
     On a signed link, frames to the other station are signed and its own are accepted only if signed. Raises OSError if
     the address cannot be used.
@@ -40,7 +42,7 @@ class Mirror:
         except OSError:
             self._socket.close()
             raise
-        self.address: Address = (self._socket.getpeername()[0], port)
+        self.address = (str(self._socket.getpeername()[0]), port)
         self._socket.setblocking(False)
 
     def __enter__(self) -> Self:
@@ -66,7 +68,7 @@ class Mirror:
         own. Requests that change the rate of the telemetry used for control are refused: displays ask for a few
         positions a second when they connect.
         """
-        own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
+        own = {vehicle.wire_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []
         for frame in self._received(now_ns):
             name = mavlink.message_name(frame.msg_id)

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Self
 
-from gcs.link.datagram import Address
 from gcs.runs.record import TRUTH_FILE
 from gcs.runs.refusals import VEHICLES_FILE
 
@@ -28,7 +27,7 @@ class VehicleProcess:
         self,
         scenario_file: Path,
         *,
-        station: Address,
+        station: tuple[str, int],
         folder: Path,
         key_file: Path | None = None,
         outlive_station: bool = False,

@@ -15,6 +15,7 @@ from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
 from scenarios.files import fingerprint
+from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S, Scenario
 
 TAKEN_OVER = "taken over: they were there already"
@@ -91,7 +92,7 @@ class Presence:
             outgoing: list[Outgoing] = []
             for system_id in sorted(left):
                 self._sequence += 1
-                frame = mavlink.encode(msg_id, fields(target_system=system_id), sequence=self._sequence)
+                frame = mavlink.encode(msg_id, fields(target_system=wire_id(system_id)), sequence=self._sequence)
                 outgoing.append((frame, self._addresses[system_id]))
             self._link.send(outgoing)
             for frame in self._listen(now_ns + _ASK_AGAIN_NS):
@@ -108,7 +109,8 @@ class Presence:
             self._link.wait(until_ns)
             now_ns = clock_ns()  # before reading, so that everything that arrived by then is received
             for datagram in self._link.receive():
-                for frame in mavlink.decode_either(datagram.data, Counter()):
+                frames_in = mavlink.decode_either(datagram.data, Counter())
+                for frame in mavlink.in_network(frames_in, datagram.address[2]):
                     if frame.system_id in self._wanted:
                         self._addresses[frame.system_id] = datagram.address
                         frames.append(frame)

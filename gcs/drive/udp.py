@@ -6,6 +6,7 @@ arrived, so a busy station does not lengthen the delays that it measures.
 
 import contextlib
 import ctypes
+import errno
 import gc
 import os
 import select
@@ -13,7 +14,7 @@ import socket
 import struct
 import time  # noqa: TID251 - this is a driver
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Self
 
 from gcs.control.phases import Phase
@@ -21,7 +22,7 @@ from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
-from gcs.link.datagram import Address, Datagram, Outgoing
+from gcs.link.datagram import Datagram, Logged, Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import MIRROR, RunWriter
 from gcs.runs.refusals import REFUSED, Refusals, in_words
@@ -37,6 +38,7 @@ _TOGETHER_NS = 3_000_000
 _BEFORE_TICK_NS = 2_000_000
 """This long before a tick, what has arrived is read. 250 vehicles send 30 datagrams in the time that is left."""
 _PR_SET_TIMERSLACK = 29
+_PORTS_TO_TRY, _LAST_PORT = 100, 65535
 
 
 def clock_ns() -> int:
@@ -57,58 +59,73 @@ def realtime_offset_ns() -> int:
 
 
 class StationSocket:
-    """One bound UDP socket with kernel receive stamps; with a guard, all its frames are signed and verified.
+    """A bound UDP socket for each network, with kernel receive stamps; with a guard, frames are signed and verified.
 
-    Raises OSError if the address cannot be bound.
+    `port` is that of network 0, also if it has no vehicles; network k listens at the port k above. With port 0, free
+    ones are found. Raises OSError if an address cannot be bound.
     """
 
-    def __init__(self, host: str, port: int, guard: Guard | None = None) -> None:
-        self.guard = guard
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-            self._socket.bind((host, port))
-        except OSError:
-            self._socket.close()
-            raise
-        self._socket.setblocking(False)
-        self.bound_ns = self._emptied_ns = self._woken_ns = clock_ns()
+    def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
+        self.guard, self.networks = guard, networks
+        self._sockets = _bound(host, port, networks)
+        self.bound_ns = self._woken_ns = clock_ns()
+        self._emptied_ns = dict.fromkeys(networks, self.bound_ns)
         self.send_errors = 0
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._socket.close()
+        for own in self._sockets.values():
+            own.close()
 
     @property
-    def address(self) -> Address:
-        host, port = self._socket.getsockname()
-        return host, port
+    def address(self) -> tuple[str, int]:
+        """Where network 0 listens, or would."""
+        network, own = next(iter(self._sockets.items()))
+        host, port = own.getsockname()
+        return host, port - network
 
     def wait(self, until_ns: int) -> None:
         """Wait until a datagram arrives or a time is reached; datagrams that follow closely are awaited together."""
         left_s = max(0, until_ns - clock_ns()) * 1e-9
-        select.select([self._socket], [], [], left_s)
+        select.select(self._sockets.values(), [], [], left_s)
         time.sleep(max(0, min(until_ns, self._woken_ns + _TOGETHER_NS) - clock_ns()) * 1e-9)
         self._woken_ns = clock_ns()
 
     def receive(
         self, refused: Counter[str] | None = None, is_another: Callable[[int, Datagram], bool] | None = None
     ) -> list[Datagram]:
-        """All waiting datagrams, oldest first, with their arrival on the station's clock.
+        """All waiting datagrams, the oldest of each network first, with their arrival on the station's clock.
 
         `refused` and `is_another` are those of `Guard.received`.
         """
         datagrams: list[Datagram] = []
+        for network in self._sockets:
+            self._receive(network, datagrams)
+        if self.guard is not None:
+            return self.guard.received(datagrams, clock_ns(), Counter() if refused is None else refused, is_another)
+        return datagrams
+
+    def send(self, outgoing: list[Outgoing]) -> list[int]:
+        """Send datagrams; returns when each had been handed to the kernel, on the station's clock."""
+        sent_ns: list[int] = []
+        for data, (host, port, network) in outgoing if self.guard is None else self.guard.sent(outgoing, clock_ns()):
+            try:
+                self._sockets[network].sendto(data, (host, port))
+            except OSError:  # a full buffer or a closed port is a loss, which the link statistics show
+                self.send_errors += 1
+            sent_ns.append(clock_ns())
+        return sent_ns
+
+    def _receive(self, network: int, datagrams: list[Datagram]) -> None:
+        own, oldest_ns = self._sockets[network], self._emptied_ns[network]
         begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
-        oldest_ns = self._emptied_ns
         for _ in range(_DATAGRAMS_A_STEP):
             try:
-                data, ancillary, _, address = self._socket.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
+                data, ancillary, _, (host, port) = own.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
             except BlockingIOError:
-                self._emptied_ns = begin_ns
+                self._emptied_ns[network] = begin_ns
                 break
             except ConnectionError:  # an earlier datagram met a closed port; the vehicle will count as silent
                 self.send_errors += 1
@@ -118,21 +135,35 @@ class StationSocket:
             # Stamps jump when the wall clock is set, but nothing arrived before the socket was last empty.
             received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
             received_ns = min(max(received_ns, oldest_ns), read_ns)
-            datagrams.append(Datagram(data, address, received_ns, read_ns - received_ns))
-        if self.guard is not None:
-            return self.guard.received(datagrams, clock_ns(), Counter() if refused is None else refused, is_another)
-        return datagrams
+            datagrams.append(Datagram(data, (host, port, network), received_ns, read_ns - received_ns))
 
-    def send(self, outgoing: list[Outgoing]) -> list[int]:
-        """Send datagrams; returns when each had been handed to the kernel, on the station's clock."""
-        sent_ns: list[int] = []
-        for data, address in outgoing if self.guard is None else self.guard.sent(outgoing, clock_ns()):
-            try:
-                self._socket.sendto(data, address)
-            except OSError:  # a full buffer or a closed port is a loss, which the link statistics show
-                self.send_errors += 1
-            sent_ns.append(clock_ns())
-        return sent_ns
+
+def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
+    """The sockets of networks, see `StationSocket`."""
+    if port or len(networks) == 1:
+        return _bound_at(host, port, networks)
+    for _ in range(_PORTS_TO_TRY):
+        with contextlib.suppress(OSError):
+            return _bound_at(host, port, networks)
+    raise OSError(errno.EADDRINUSE, "no free ports in a row")
+
+
+def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
+    """The sockets of networks; with port 0 the first is bound to any free port, which says where the others are."""
+    with contextlib.ExitStack() as opened:
+        sockets: dict[int, socket.socket] = {}
+        for network in networks:
+            own = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            if port + network > _LAST_PORT:
+                raise OSError(errno.EADDRNOTAVAIL, f"there is no port {port + network} for network {network}")
+            own.bind((host, port + network if port else 0))
+            port = own.getsockname()[1] - network
+            own.setblocking(False)
+            sockets[network] = own
+        opened.pop_all()
+    return sockets
 
 
 @contextlib.contextmanager
@@ -174,8 +205,8 @@ def drive(
     to the vehicles.
     """
     plan = station.plan
-    log: list[tuple[bytes, int]] = []
-    """Frames received and sent since the last tick, in order, with their times."""
+    log: list[Logged] = []
+    """Frames received and sent since the last tick, in order."""
     refusals = Refusals()
 
     def log_refusals(now_ns: int, *, last: bool = False) -> None:
@@ -192,25 +223,25 @@ def drive(
         if station.next_event_ns <= now_ns < station.next_tick_ns:
             requests, _ = station.step([], now_ns)  # before anything is read: a round trip counts from this step
             link.send(requests)
-            log += [(data, now_ns) for data, _ in requests]
+            log += [(data, now_ns, address) for data, address in requests]
         datagrams = link.receive(station.counters, station.is_another)
         now_ns = clock_ns()
         outgoing, tick = station.step(datagrams, now_ns)
         sent_ns = link.send(outgoing)
         if mirror is not None:
-            mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in requests + outgoing], now_ns)
+            received = [frame for frame, _, _ in station.frames]
+            mirror.forward(received + [data for data, _ in requests + outgoing], now_ns)
             link.send(mirror.passed_on(station.vehicles, now_ns))
         log += station.frames
         log += [
-            (data, own_ns if mavlink.is_set_point(data) else now_ns)
-            for (data, _), own_ns in zip(outgoing, sent_ns, strict=True)
+            (data, own_ns if mavlink.is_set_point(data) else now_ns, address)
+            for (data, address), own_ns in zip(outgoing, sent_ns, strict=True)
         ]
         station.frames.clear()
         if tick is None:
             continue
         writer.tick(station.complete(tick, sent_ns))
-        offset_ns = realtime_offset_ns()
-        writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in log])
+        writer.frames(log, realtime_offset_ns())
         for event in station.events:
             writer.event(event)
         log.clear()

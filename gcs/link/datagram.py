@@ -2,7 +2,8 @@
 
 from typing import NamedTuple
 
-Address = tuple[str, int]
+Address = tuple[str, int, int]
+"""Host and port, and the network: the number of the station's socket that this address sends to."""
 
 
 class Datagram(NamedTuple):
@@ -20,3 +21,5 @@ Arrival = tuple[bytes, Address, int, int]
 """A `Datagram`, or a plain tuple of the same, which takes a fifth of the time to make."""
 Outgoing = tuple[bytes, Address]
 """One datagram to be sent, and to whom."""
+Logged = tuple[bytes, int, Address]
+"""A frame, when it was received or sent, and from or to whom."""

@@ -15,6 +15,7 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Array, Records, int64, kernel
+from scenarios.networks import system_id_of
 
 STATION_SYSTEM_ID = 255
 STATION_COMPONENT_ID = 190
@@ -132,6 +133,11 @@ def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The valid frames of one datagram, which holds either MAVLink 1 or MAVLink 2."""
     return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
+
+
+def in_network(frames: list[Frame], network: int) -> list[Frame]:
+    """Frames received in a network, with the system ids of `scenarios.networks`."""
+    return [frame._replace(system_id=system_id_of(network, frame.system_id)) for frame in frames] if network else frames
 
 
 def first_heartbeats(datagram: bytes, refused: Counter[str]) -> list[Frame]:
@@ -328,7 +334,7 @@ def _put_float(data: Array, place: int, value: float) -> None:
 
 
 @kernel
-def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, system_id: int, sequence: int) -> None:
+def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, target: int, sequence: int) -> None:
     """Write the frame of a set-point into an array of zeros of its length; its last byte is the frame, never zero."""
     point = points[row]
     data[0], data[1], data[4], data[5], data[6] = (
@@ -346,17 +352,18 @@ def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, syste
         _put_float(data, _HEADER_BYTES + 4 * (7 + k), point.acceleration_ne_m_s2[k])
     end = _HEADER_BYTES + _SET_POINT_BYTES
     _put(data, end - 5, np.uint64(point.type_mask), 2)
-    data[end - 3], data[end - 2], data[end - 1] = system_id, 1, _LOCAL_FRAME
+    data[end - 3], data[end - 2], data[end - 1] = target, 1, _LOCAL_FRAME
     _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
 
 
-def set_point_frames(points: Records, rows: Array, sequences: Array, system_ids: Array, key_ms: int) -> list[bytes]:
+def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> list[bytes]:
     """The frames of the set-points of some vehicles, each numbered in a sequence of its own.
 
-    `points` (SET_POINT), `sequences` and `system_ids` hold those of all vehicles; `sequences` is advanced.
+    `points` (SET_POINT), `sequences` and `targets` (their ids in frames) are those of all vehicles; `sequences` is
+    advanced.
     """
     frames = np.zeros((len(rows), _OVERHEAD + _SET_POINT_BYTES), np.uint8)
-    _encode_set_points(frames, points, rows, sequences, system_ids, key_ms)
+    _encode_set_points(frames, points, rows, sequences, targets, key_ms)
     return rows_of(frames)
 
 
@@ -368,12 +375,12 @@ def rows_of(frames: Array) -> list[bytes]:
 
 @kernel
 def _encode_set_points(
-    frames: Array, points: Records, rows: Array, sequences: Array, system_ids: Array, key_ms: int
+    frames: Array, points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int
 ) -> None:
     for place in range(len(rows)):
         row = rows[place]
         sequences[row] = (sequences[row] + 1) & 0xFF
-        _encode_set_point(frames[place], points, row, key_ms, system_ids[row], sequences[row])
+        _encode_set_point(frames[place], points, row, key_ms, targets[row], sequences[row])
 
 
 REQUEST_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES

@@ -35,6 +35,7 @@ from gcs.link.mavlink import encode_request
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
 from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
 from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
+from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
 
 ARMED = 0x80
@@ -175,7 +176,7 @@ class RemoteVehicle:
         links: Links | None = None,
         row: int = 0,
     ) -> None:
-        self.system_id = system_id
+        self.system_id, self.wire_id = system_id, wire_id(system_id)
         self.external = external
         """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter."""
         self._links, self._row = links or new_links(1), row
@@ -429,7 +430,7 @@ class RemoteVehicle:
             return None
         frame = self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
-            due = self.startup.next_parameter(now_ns, target_system=self.system_id, rtt_ns=self.clock.rtt_ns or 0)
+            due = self.startup.next_parameter(now_ns, target_system=self.wire_id, rtt_ns=self.clock.rtt_ns or 0)
             idle = due is None and self._command is None and not self.kind.piloted
             self._settled = idle and not self._next_step().missing
             return None if due is None else self.encode(*due)
@@ -458,7 +459,7 @@ class RemoteVehicle:
             mavlink.COMMAND_LONG,
             mavlink.command_long(
                 waiting.command,
-                target_system=self.system_id,
+                target_system=self.wire_id,
                 confirmation=waiting.confirmation,
                 parameters=waiting.parameters,
             ),

@@ -26,7 +26,7 @@ from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED
 Truth = NDArray[np.void]
 """Records as sim_vehicles.links.truth.DTYPE lays them out."""
 
-_RECORD = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
+_RECORD = np.dtype([("kind", "u1"), ("system_id", "<u2"), ("key", "<u4"), ("time_ns", "<i8")])
 _TIMESYNC = 111
 
 

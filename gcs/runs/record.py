@@ -9,6 +9,7 @@ import contextlib
 import json
 import os
 import struct
+from collections import defaultdict
 from collections.abc import Generator, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from gcs.control.tick import Event, TickArray
+from gcs.link.datagram import Logged
 
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
@@ -25,6 +27,7 @@ TICKS_FILE = "ticks.part"
 PARQUET_FILE = "ticks.parquet"
 EVENTS_FILE = "events.jsonl"
 TLOG_FILE = "flight.tlog"
+"""The telemetry log of network 0, see `tlog_file`."""
 TRUTH_FILE = "truth.bin"
 """When the simulated vehicles sampled their states and when set-points acted, as they know it."""
 MIRROR = "mirror"
@@ -44,8 +47,14 @@ STARTED = "started by the station"
 LOG_ENDED = "log"
 """Kind of the event that a file can no longer be written: its name and the reason."""
 _MOST_WAITING = 1000
+_STAMP = struct.Struct(">Q")
 READY_FILE = ".observer-ready"
 """Exists while an observer follows the run."""
+
+
+def tlog_file(network: int | str) -> str:
+    """The name of a network's telemetry log: frames do not say which network they belong to."""
+    return TLOG_FILE if network == 0 else f"flight-{network}.tlog"
 
 
 class RunWriter:
@@ -57,6 +66,7 @@ class RunWriter:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._logs = {name: RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)}
         self._ended: set[str] = set()
         self._waiting: list[Event] = []
@@ -77,11 +87,16 @@ class RunWriter:
             self._logs[EVENTS_FILE].add("".join(lines).encode())
             self._waiting.clear()
 
-    def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
-        """Log frames, each with its time in ns since 1970, in the .tlog layout: big-endian µs, then the frame."""
-        entries = b"".join(struct.pack(">Q", time_ns // 1000) + frame for frame, time_ns in frames)
-        if entries:
-            self._add(TLOG_FILE, entries)
+    def frames(self, frames: Iterable[Logged], epoch_ns: int = 0) -> None:
+        """Log frames in the .tlog layout: big-endian µs since 1970, then the frame.
+
+        `epoch_ns` is the instant, in ns since 1970, from which their times count.
+        """
+        entries: dict[int, list[bytes]] = defaultdict(list)
+        for frame, time_ns, (_, _, network) in frames:
+            entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
+        for network, parts in entries.items():
+            self._add(tlog_file(network), b"".join(parts))
 
     def ended(self, name: str, error: OSError) -> None:
         """Note that a file of the run could not be written; it is left as it is from now on."""
@@ -98,6 +113,8 @@ class RunWriter:
         if name in self._ended:
             return
         try:
+            if name not in self._logs:  # that of a network
+                self._logs[name] = RecordLog(self._folder / name)
             self._logs[name].add(data)
         except OSError as error:
             self.ended(name, error)

@@ -19,12 +19,13 @@ from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
 from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
-from gcs.link.datagram import Arrival, Datagram, Outgoing
+from gcs.link.datagram import Arrival, Datagram, Logged, Outgoing
 from gcs.link.mavlink import TIMESYNC, float_at, unsigned_at, usual_message
 from gcs.link.sequence import DUPLICATE, NEW, count
 from gcs.link.vehicle import RemoteVehicle, Report, delivery_ns
 from gcs.station.fleet_kind import FleetKind
 from scenarios.kernel import Array, Records, int64, kernel
+from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
 AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
@@ -98,8 +99,8 @@ class Reception:
         self.reported = new_reported(n)
         self.telemetry_ns = np.zeros(n, np.int64)
         """When the newest state of each vehicle came."""
-        self.frames: list[tuple[bytes, int]] = []
-        """Frames received since the driver last took them, each with the time at which it was received."""
+        self.frames: list[Logged] = []
+        """Frames received since the driver last took them."""
         self.counters: Counter[str] = Counter()
         """Frames that were refused, by reason."""
         self.touched: set[int] = set()
@@ -107,9 +108,9 @@ class Reception:
         self._fresh_rtt_s = defaultdict[int, deque[float]](deque)
         """By row, the round trips that no tick holds yet."""
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
-        self._row_of = np.full(256, -1)
+        self._row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
-            self._row_of[system_id] = row
+            self._row_of[network_of(system_id), wire_id(system_id)] = row
         self._news_of(1)
 
     def _news_of(self, datagrams: int) -> None:
@@ -131,8 +132,8 @@ class Reception:
         return found_s
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
-        """Whether a frame claims the system id of a vehicle that is known to send from another address."""
-        row = self._row.get(system_id)
+        """Whether a frame claims this id, as in frames, of a vehicle that is known to send from another address."""
+        row = self._row.get(system_id_of(datagram.address[2], system_id))
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
     def take(self, datagrams: Sequence[Arrival], now_ns: int) -> list[Outgoing]:
@@ -145,6 +146,7 @@ class Reception:
         data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True)
         numbers, known = self._fleet.links.addresses, -1
         stream, table = np.frombuffer(b"".join(data), np.uint8), np.empty((0, 0), np.int64)
+        networks = np.empty(0, np.int64)
         now = Now(now_ns, self._start_ns, self._period_ns)
         place = 0
         while place < len(datagrams):
@@ -153,8 +155,9 @@ class Reception:
                 senders = [numbers.get(address, _NOT_KNOWN) for address in addresses]
                 columns = array("q", [*accumulate(map(len, data)), *senders, *received_ns, *queued_ns])
                 table = np.frombuffer(columns, np.int64)
-            stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, now)
-            self.frames += zip(data[place:stop], received_ns[place:stop], strict=True)
+                networks = np.array([network for _, _, network in numbers], np.int64)
+            stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, networks, now)
+            self.frames += zip(data[place:stop], received_ns[place:stop], addresses[place:stop], strict=True)
             self._follow_up(outgoing)
             if stop < len(datagrams):
                 self._take(Datagram(*datagrams[stop]), now, outgoing)
@@ -168,7 +171,7 @@ class Reception:
             frames = mavlink.first_heartbeats(datagram.data, self.counters)
         else:
             frames = mavlink.decode(datagram.data, self.counters)
-        for frame in frames:
+        for frame in mavlink.in_network(frames, datagram.address[2]):
             row = self._row.get(frame.system_id)
             if row is None:
                 self.counters["unknown system id"] += 1
@@ -183,7 +186,7 @@ class Reception:
             vehicle.heard_ns = datagram.received_ns
             vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
             self.touched.add(row)
-            self.frames.append((frame.data, datagram.received_ns))
+            self.frames.append((frame.data, datagram.received_ns, datagram.address))
             if frame.component_id != AUTOPILOT_COMPONENT:
                 self.counters["other component"] += 1
                 continue
@@ -260,11 +263,13 @@ def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int, deli
 
 
 @kernel
-def _take_usual(tables: Tables, stream: Array, datagrams: Array, first: int, row_of: Array, now: Now) -> int:
+def _take_usual(
+    tables: Tables, stream: Array, datagrams: Array, first: int, row_of: Array, networks: Array, now: Now
+) -> int:
     """Take in the datagrams from the `first` on; returns the place of one that is not usual, or their number.
 
     The rows of `datagrams` say of each where it ends in the stream, the number of its sender's address, when it was
-    received and how long it was queued.
+    received and how long it was queued. `networks` are those of the numbered addresses.
     """
     ends, senders, received_ns, queued_ns = datagrams[0], datagrams[1], datagrams[2], datagrams[3]
     for place in range(first, len(ends)):
@@ -272,7 +277,9 @@ def _take_usual(tables: Tables, stream: Array, datagrams: Array, first: int, row
         msg_id = usual_message(stream, begin, end)
         if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
             return place
-        row = row_of[stream[begin + 5]]
+        if senders[place] < 0:
+            return place
+        row = row_of[networks[senders[place]], stream[begin + 5]]
         if row < 0 or tables.links[row].address != senders[place]:
             return place
         payload, payload_end = begin + _HEADER_BYTES, end - _CHECKSUM_BYTES

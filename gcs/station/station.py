@@ -90,6 +90,7 @@ class Station:
         self._repetitions = Repetitions(rates, n)
         self._used_s = np.full(n, nan)
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
+        self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
         self._tolerated = None if measured else self._tolerances(np.zeros(n))
         """The tolerances of every tick, if they do not depend on a measured delay."""
@@ -195,7 +196,7 @@ class Station:
         """Add the set-points to the datagrams to be sent; returns their indices there, -1 for none."""
         links = self._fleet.links.known
         rows = (points["sent"] & (links["address"] >= 0)).nonzero()[0]
-        frames = mavlink.set_point_frames(points, rows, links["sequence"], self._system_ids, key_ms)
+        frames = mavlink.set_point_frames(points, rows, links["sequence"], self._targets, key_ms)
         indices = [-1] * len(points)
         for row, frame in zip(rows.tolist(), frames, strict=True):
             address = self.vehicles[row].address

@@ -23,6 +23,7 @@ from gcs.published import Published
 from gcs.runs.grade import Grade, grade
 from gcs.runs.summary_record import Control
 from scenarios.keys.course import Course
+from scenarios.networks import ids_of, wire_id
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
@@ -110,14 +111,15 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
     if scenario.manoeuvres:
         scenario = scenario.in_steady_flight().model_copy(update={"course": Course()})
     velocity = scenario.nominal_velocity[0].velocity_ne_m_s
-    vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
+    ids = ids_of(count)
+    vehicles = [Vehicle(system_id=ids[0], position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
     for k in range(count - 1):
         column, place = divmod(k, _COLUMN)
         aside = _SPACING_M * (column + 1)
         vehicles.append(
             Vehicle(
-                system_id=k + 2,
-                follows=1 if place == 0 else k + 1,
+                system_id=ids[k + 1],
+                follows=ids[0 if place == 0 else k],
                 offset_ne_m=(-_SPACING_M, aside if place == 0 else 0.0),
                 position_ne_m=(-_SPACING_M * (place + 1), aside),
                 velocity_ne_m_s=velocity,
@@ -236,7 +238,8 @@ def position_frames(count: int) -> list[bytes]:
     """One LOCAL_POSITION_NED of each of `count` vehicles in flight; no byte of it is omitted as a trailing zero."""
     states = [(1000 + k, 100.5 * k, -3.25 * k, -1000.0, 91.44, 0.125, -0.5) for k in range(count)]
     position = mavlink.LOCAL_POSITION_NED
-    return [mavlink.encode(position, state, sequence=0, system_id=k + 1) for k, state in enumerate(states)]
+    numbered = zip(map(wire_id, ids_of(count)), states, strict=True)
+    return [mavlink.encode(position, state, sequence=0, system_id=own) for own, state in numbered]
 
 
 def pymavlink_parse_s(frames: Sequence[bytes]) -> float:

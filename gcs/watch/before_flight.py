@@ -22,6 +22,7 @@ from gcs.watch.links import Requests, Watch
 from gcs.watch.live import watch_links
 from gcs.watch.saved_links import LinkRecorder
 from scenarios.files import dump
+from scenarios.networks import network_of
 from scenarios.own_code import write_code
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -102,8 +103,9 @@ def _watch_virtually(found: _Measurement, scenario: Scenario) -> None:
     now_ns, to_vehicles = START_NS, Sent()
     while not found.is_long_enough(now_ns) and now_ns - START_NS < found.patience_s * NS_PER_S:
         for system_id, data, time_ns in vehicles.step(to_vehicles, now_ns):
-            for frame in mavlink.decode(data, found.watch.counters):
-                found.watch.take(frame, time_ns, ("virtual", system_id))
+            network = network_of(system_id)
+            for frame in mavlink.in_network(mavlink.decode(data, found.watch.counters), network):
+                found.watch.take(frame, time_ns, ("virtual", system_id, network))
                 found.recorder.note(frame, time_ns)
-        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in requests.due(found.watch, now_ns)]
+        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id, _) in requests.due(found.watch, now_ns)]
         now_ns = requests.next_ns

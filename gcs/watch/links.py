@@ -325,7 +325,7 @@ class Requests:
             self.positions_asked += 1
             parameters = float(mavlink.LOCAL_POSITION_NED), float(self._position_interval_us)
             fields = mavlink.command_long(
-                SET_MESSAGE_INTERVAL, target_system=system_id, confirmation=0, parameters=parameters
+                SET_MESSAGE_INTERVAL, target_system=vehicle.remote.wire_id, confirmation=0, parameters=parameters
             )
             asked.append(self._numbered(mavlink.COMMAND_LONG, fields, address))
         return asked

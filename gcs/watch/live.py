@@ -66,7 +66,8 @@ def watch_links(
         while now_ns < end_ns and not stop_reason():
             link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
             for datagram in link.receive(watch.counters):
-                for frame in mavlink.decode_either(datagram.data, watch.counters):
+                frames = mavlink.decode_either(datagram.data, watch.counters)
+                for frame in mavlink.in_network(frames, datagram.address[2]):
                     watch.take(frame, datagram.received_ns, datagram.address)
                     if recorder is not None:
                         recorder.note(frame, datagram.received_ns)

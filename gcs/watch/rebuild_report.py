@@ -10,10 +10,11 @@ import numpy as np
 from pydantic import PlainSerializer
 
 from gcs.control.tick import Event, TickArray
+from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.published import Published
 from gcs.runs.files import read_design, read_summary
-from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
+from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE, tlog_file
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
 from gcs.station.absence import COMPLETED
@@ -42,6 +43,11 @@ class LogSource:
 def found(run_or_file: Path) -> LogSource:
     """The log, and the files beside it if it lies in a run's folder."""
     log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
+    if run_or_file.is_dir() and (others := sorted(run_or_file.glob(tlog_file("*")))):
+        raise InputError(
+            f"{run_or_file}: read a telemetry log for each network ({', '.join(file.name for file in others)}), wanted "
+            "a run of network 0 alone, or one of its logs"
+        )
 
     def beside(name: str, read: Callable[[Path], _Found]) -> _Found | None:
         file = log_file.with_name(name)

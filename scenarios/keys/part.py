@@ -5,15 +5,24 @@ Numbers are bounded where the messages (single precision) and the clocks (nanose
 
 from typing import Annotated, Literal, LiteralString
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
 from pydantic_core import PydanticCustomError
+
+from scenarios.networks import LARGEST_ID, MOST_IN_NETWORK, wire_id
 
 MOST = 1e6
 Number = Annotated[float, Field(ge=-MOST, le=MOST)]
 Position = tuple[Number, Number]
 Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
 Velocity = tuple[Speed, Speed]
-SystemId = Annotated[int, Field(ge=1, le=250)]
 Positive = Annotated[float, Field(gt=0, le=MOST)]
 NotNegative = Annotated[float, Field(ge=0, le=MOST)]
 Factor = Annotated[float, Field(ge=1, le=1000)]
@@ -27,6 +36,15 @@ HELD_SHARE = 0.99
 """With `control.execute_at`: the share of the set-points that arrive before they are to act."""
 PREDICTION_MAX_S = 10.0
 """Longest loop delay that the station predicts over."""
+
+
+def _in_a_network(system_id: int) -> int:
+    if not 1 <= wire_id(system_id) <= MOST_IN_NETWORK:
+        raise PydanticCustomError("system_id", "system_id")
+    return system_id
+
+
+SystemId = Annotated[int, Field(ge=1, le=LARGEST_ID), AfterValidator(_in_a_network)]
 
 
 def one_fault(kind: LiteralString, **context: float) -> WrapValidator:

@@ -49,8 +49,8 @@ class SignedLink:
     """One system's end of one link.
 
     `crc_extra` gives, for each message id, the byte that ends the checksummed data; `epoch_ns` is the time, in ns since
-    1970, at which the clock of `now_ns` is 0. Where several ends share one memory of timestamps, `owner` is the system
-    id of this end.
+    1970, at which the clock of `now_ns` is 0. Where several ends share one memory of timestamps, `owner` is a number
+    for this end: the vehicle's system id, or the station's network.
     """
 
     def __init__(
@@ -61,9 +61,10 @@ class SignedLink:
         self._offset_ns = epoch_ns - EPOCH_NS
         self._link_id = bytes([link_id])
         self._stamps = stamps
-        self._streams = 1 << 32 | owner << 24
+        of_owner = (owner & 0xFF) << 24 | owner >> 8 << 40
+        self._streams = 1 << 32 | of_owner
         """High bits of the number of a received stream; system, component and link id are the low bits."""
-        self._own = 1 << 33 | owner << 24 | link_id
+        self._own = 1 << 33 | of_owner | link_id
         self._timestamp = stamps.known.get(self._own, 0)
         stamps.keep(self._own, self._timestamp)
         self._recent: dict[int, _Recent] = {}

@@ -137,10 +137,14 @@ def _links_only(
     options: argparse.Namespace,
     opened: contextlib.ExitStack,
 ) -> None:
+    from scenarios.networks import networks_of
     from sim_vehicles.drive.relay_udp import Peers
     from sim_vehicles.drive.udp import run
     from sim_vehicles.links.relay import Relay
 
+    if (networks := networks_of(vehicle.system_id for vehicle in scenario.vehicles)) != [0]:
+        read = f"vehicles in the networks {' '.join(map(str, networks))}"
+        raise _UsageError(f"--links-only: read {read}, wanted those of network 0: frames do not name their network")
     try:
         peers = Peers(options.vehicle_port, options.station)
     except OSError as error:

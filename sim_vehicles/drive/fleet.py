@@ -116,15 +116,11 @@ class Fleet:
             up, down = self._links.of(own.system_id)
             self._members[own.system_id] = _Member(row, vehicle, up, down, signed[own.system_id] if signed else None)
             self._columns["plain"][row] = craft.is_plain and up.plain and not signed and not self._in_order
-        self._in_rows = list(self._members.values())
+        self._in_rows, self.system_ids = [*self._members.values()], tuple(self._members)
         for member in self._in_rows:
             self._plan(member)
         if self._sector is not None:
             heapq.heappush(self._acts, (start_ns, _SECTOR))
-
-    @property
-    def system_ids(self) -> tuple[int, ...]:
-        return tuple(self._members)
 
     @property
     def next_event_ns(self) -> int:
@@ -183,7 +179,7 @@ class Fleet:
             self._run_in_order(received, now_ns)
             received = ()
         entering = list(received)
-        numbers = [number for system_id, data, time_ns in entering for number in (system_id, len(data), time_ns)]
+        numbers = [number for key, data, time_ns in entering for number in (self._members[key].row, len(data), time_ns)]
         data = np.frombuffer(b"".join([data for _, data, _ in entering]), np.uint8)
         edge = data, np.array(numbers, np.int64), self._waiting, self._leaving, self._leaving_data
         entered, waiting, leaving = step_all(*self._arrays(), *edge, 0, now_ns)
@@ -198,7 +194,8 @@ class Fleet:
         while leaving:
             rows: list[list[int]] = self._leaving[:leaving].tolist()
             left = self._leaving_data[: rows[-1][2]].tobytes()
-            out += [(system_id, left[begin:end], due_ns) for system_id, begin, end, due_ns in rows]
+            ids = self.system_ids
+            out += [(ids[row], left[begin:end], due_ns) for row, begin, end, due_ns in rows]
             if leaving < len(self._leaving):
                 break
             leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)

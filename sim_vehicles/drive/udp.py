@@ -8,6 +8,7 @@ import contextlib
 import ctypes
 import gc
 import os
+import resource
 import select
 import socket
 import struct
@@ -16,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Generator
 from typing import NamedTuple
 
+from scenarios.networks import network_of
 from scenarios.schema import NS_PER_S
 from sim_vehicles.drive.fleet import Datagram
 
@@ -35,6 +37,8 @@ LATE_NS = 5_000_000
 CLOCK_GAP_NS = 3_000
 """A reading of both clocks that took longer than this was interrupted, and is discarded."""
 
+_OTHER_FILES = 100
+"""Files that are open beside the sockets, and room for more."""
 _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _PR_SET_TIMERSLACK = 29
 _STAMP = struct.Struct("qq")
@@ -155,13 +159,16 @@ class Sockets:
 class Ports:
     """The vehicles' sockets, each connected to the station, so that datagrams of others are not accepted.
 
-    Raises OSError if the station's address cannot be used.
+    `station` is where the station listens to network 0; network k has the port k above. Raises OSError if an address
+    cannot be used, or too few files may be open.
     """
 
     def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int]) -> None:
         self.sockets = Sockets()
         try:
-            self._descriptors = {system_id: self.sockets.add(connect=station) for system_id in system_ids}
+            _allow_open(len(system_ids) + _OTHER_FILES)
+            host, port = station
+            self._descriptors = {key: self.sockets.add(connect=(host, port + network_of(key))) for key in system_ids}
         except OSError:
             self.sockets.close()
             raise
@@ -175,6 +182,14 @@ class Ports:
     def send(self, datagrams: list[Datagram]) -> None:
         for system_id, data, due_ns in datagrams:
             self.sockets.send(self._descriptors[system_id], data, due_ns)
+
+
+def _allow_open(files: int) -> None:
+    """See to it that this process may have so many files open, which is often limited to 1,024."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < files and soft != resource.RLIM_INFINITY:
+        most = files if hard == resource.RLIM_INFINITY else min(files, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 class _Clocks:

@@ -12,6 +12,7 @@ import numpy as np
 from scenarios import schema
 from scenarios.kernel import Cell, kernel
 from scenarios.keys import link as link_keys
+from scenarios.networks import MOST_IN_NETWORK
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links import truth
 from sim_vehicles.links.fate import BLOCK, Stream, behaviour_of, constant, delay_at, flip, flips_of, in_outage
@@ -25,7 +26,6 @@ from sim_vehicles.services.mavlink import message_id
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
-MOST_ID = 250
 """The largest system id of a vehicle."""
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
@@ -215,9 +215,9 @@ class Link:
 
 
 @kernel
-def row_of(system_id: int, kind: int) -> int:
-    """Where the link of a vehicle is among the queues of a `LinkSet`."""
-    return 2 * system_id + (kind == LINK_DOWN)
+def row_of(number: int, kind: int) -> int:
+    """Where a vehicle's link is among the queues of a `LinkSet`, which numbers vehicles as they are asked for."""
+    return 2 * number + (kind == LINK_DOWN)
 
 
 class LinkSet:
@@ -230,7 +230,7 @@ class LinkSet:
         self._channels: dict[tuple[str, int, int], Channel] = {}
         self._known = {channel.name: channel for channel in scenario.links.channels}
         self._pairs: dict[int, tuple[Link, Link]] = {}
-        self.queues = new_queues(2 * (MOST_ID + 1))
+        self.queues = new_queues(2 * max(MOST_IN_NETWORK, len(scenario.vehicles)))
         """Of all links, in the rows of `row_of`."""
         self.zero_ns = start_ns if scenario.links.times_from == "start" else NEVER_NS
         """Host time at which the links' time is 0; NEVER_NS before the flight has begun."""
@@ -267,7 +267,7 @@ class LinkSet:
     def _made(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
-            record=self._record, queues=self.queues, row=row_of(system_id, kind),
+            record=self._record, queues=self.queues, row=row_of(len(self._pairs), kind),
         )  # fmt: skip
         made.zero_ns = self.zero_ns
         return made

@@ -11,6 +11,7 @@ from operator import itemgetter
 from typing import NamedTuple
 
 from scenarios import schema
+from scenarios.networks import MOST_IN_NETWORK
 from sim_vehicles.links.links import Link, LinkSet
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Record
 from sim_vehicles.services.clock import NEVER_NS
@@ -37,7 +38,7 @@ def sender(data: bytes) -> int | None:
         system_id = data[3]
     else:
         return None
-    return system_id if 1 <= system_id <= 250 else None
+    return system_id if 1 <= system_id <= MOST_IN_NETWORK else None
 
 
 def holds_key(data: bytes) -> bool:

@@ -21,7 +21,7 @@ KINDS = SAMPLED, ACTED, LINK_UP, LINK_DOWN, PUSHED, CARRIED, POSITION_ERROR, VEL
 DTYPE = np.dtype(
     [
         ("kind", "u1"),
-        ("system_id", "u1"),
+        ("system_id", "<u2"),
         ("key", "<u4"),
         ("time_ns", "<i8"),
         ("entered_ns", "<i8"),
@@ -45,6 +45,9 @@ and `due_ns` hold its north and east components, and `disturbances` reads them. 
 by an acceleration, or carried at a velocity. The state sampled with time_boot_ms `key` was reported with these errors.
 """
 
+_OLDER = np.dtype([(name, "u1" if name == "system_id" else DTYPE[name]) for name in DTYPE.names or ()])
+"""One record as it was written before there were several networks."""
+
 PASSED = 0
 DUPLICATE, CORRUPTED, LOST, OUTAGE, QUEUE_FULL, LINK_FULL = 1, 2, 4, 8, 16, 32
 DROPPED = LOST | OUTAGE | QUEUE_FULL | LINK_FULL
@@ -57,8 +60,8 @@ FATES = {
     LINK_FULL: "link_full",
 }
 
-_MAGIC = b"UAVTRUE2"
-_PACK = struct.Struct("<BBIqqqBq").pack
+_MAGIC, _OLDER_MAGIC = b"UAVTRUE3", b"UAVTRUE2"
+_PACK = struct.Struct("<BHIqqqBq").pack
 _BATCH = 1024
 _PARTS = 1e9
 
@@ -139,10 +142,11 @@ def read_truth(path: Path) -> npt.NDArray[np.void]:
     Raises ValueError if the file is not a truth log, or holds a record of an unknown kind.
     """
     data = path.read_bytes()
-    if not data.startswith(_MAGIC[: len(data)]):
+    layout = _OLDER if data.startswith(_OLDER_MAGIC) else DTYPE
+    if layout is DTYPE and not data.startswith(_MAGIC[: len(data)]):
         raise ValueError(f"{path} is not a truth log")
-    count = max(0, len(data) - len(_MAGIC)) // DTYPE.itemsize
-    records = np.frombuffer(data, DTYPE, count, min(len(_MAGIC), len(data)))
+    count = max(0, len(data) - len(_MAGIC)) // layout.itemsize
+    records = np.frombuffer(data, layout, count, min(len(_MAGIC), len(data))).astype(DTYPE)
     if (unknown := np.flatnonzero(~np.isin(records["kind"], KINDS))).size:
         raise ValueError(f"{path}: record {unknown[0] + 1} of {count} is of no known kind")
     return records

@@ -14,6 +14,7 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Cell, Records, kernel
+from scenarios.networks import wire_id
 from sim_vehicles.services.frames import (
     ARDUPILOT,
     FRAME_BYTES,
@@ -329,6 +330,7 @@ class Encoder:
 
 def rehearsal(system_id: int) -> list[bytes]:
     """Frames with which a station brings a vehicle into flight and commands it."""
+    system_id = wire_id(system_id)
     station = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     none = 0.0
     messages = (

@@ -7,6 +7,7 @@ offboardCheck.cpp.
 import math
 from dataclasses import dataclass
 
+from scenarios.networks import wire_id
 from scenarios.schema import Autopilot
 from sim_vehicles.motion.copter import Target
 from sim_vehicles.services import mavlink
@@ -127,7 +128,7 @@ RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 def parameters(rules: Rules, system_id: int, settings: Autopilot) -> Parameters:
     known = [
-        fixed(rules.system_id_parameter, system_id),
+        fixed(rules.system_id_parameter, wire_id(system_id)),
         timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
         timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
     ]

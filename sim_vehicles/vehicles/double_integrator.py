@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from scenarios import schema
 from scenarios.kernel import Cell, Records, kernel
 from scenarios.keys.own import aircraft_of, names_code
+from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.air import Air, Push, air_of
 from sim_vehicles.motion.aircraft import Aircraft, Attitude
@@ -125,7 +126,8 @@ class DoubleIntegrator:
             timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
         )
         formation = [] if onboard is None else formation_parameters()
-        self.parameters = Parameters([fixed("SYSID_THISMAV", own.system_id), *timeouts, *ARDUPILOT_SETUP, *formation])
+        number = fixed("SYSID_THISMAV", wire_id(own.system_id))
+        self.parameters = Parameters([number, *timeouts, *ARDUPILOT_SETUP, *formation])
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard

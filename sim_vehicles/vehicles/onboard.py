@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable
 
 from scenarios import schema
+from scenarios.networks import LARGEST_ID
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.double_integrator import Command, State
 from sim_vehicles.services.draws import Use, draws_of
@@ -34,7 +35,7 @@ def formation_parameters() -> list[Parameter]:
     """The parameters that a station sets before the flight; the loop starts switched off."""
     gains = [Parameter(name, 0.0, -LARGEST_GAIN, LARGEST_GAIN) for name in (*_NAMES_P, *_NAMES_V)]
     offsets = [Parameter(f"FORM_OFF_{axis}", 0.0, -LARGEST_OFFSET_M, LARGEST_OFFSET_M) for axis in _AXES]
-    ahead = Parameter("FORM_AHEAD", 0.0, 0.0, 250.0, whole=True)
+    ahead = Parameter("FORM_AHEAD", 0.0, 0.0, float(LARGEST_ID), whole=True)
     return [*gains, *offsets, ahead, Parameter("FORM_LOOP", 0.0, 0.0, 1.0, whole=True)]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenarios.kernel import Record, Records, kernel
-from sim_vehicles.links.links import MOST_ID, row_of
+from sim_vehicles.links.links import row_of
 from sim_vehicles.links.queue import Bytes, copy_bytes, enter, free, new_entry, ready, take, take_in
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.motion.double_integrator import Command, advance_to, set_command
@@ -203,16 +203,14 @@ def _enter_all(
 ) -> int:
     """Let datagrams enter their down links, from the first one on; returns the first that cannot, or their number.
 
-    `received` holds system id, size and time of each, one after the other, and `data` their bytes.
+    `received` holds the vehicle's row, size and time of each, one after the other, and `data` their bytes.
     """
     begin, count = 0, len(received) // 3
     for k in range(first):
         begin += received[3 * k + 1]
     for k in range(first, count):
-        system_id, size, time_ns = received[3 * k], received[3 * k + 1], received[3 * k + 2]
-        if not 0 <= system_id <= MOST_ID:
-            return k
-        row = row_of(system_id, LINK_DOWN)
+        vehicle, size, time_ns = received[3 * k], received[3 * k + 1], received[3 * k + 2]
+        row = row_of(vehicle, LINK_DOWN)
         link = links[row]
         if not link.plain or size > FRAME_BYTES or not ready(link, entries):
             return k
@@ -226,9 +224,8 @@ def run_at(
     vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, row: int, now_ns: int
 ) -> bool:
     """Run the plain vehicle in a row until now; False if it stops before an unusual event."""
-    vehicle = vehicles[row]
-    up, down = row_of(vehicle.system_id, LINK_UP), row_of(vehicle.system_id, LINK_DOWN)
-    return run(vehicle, links[up], links[down], entries, frames, draws[up], now_ns)
+    up, down = row_of(row, LINK_UP), row_of(row, LINK_DOWN)
+    return run(vehicles[row], links[up], links[down], entries, frames, draws[up], now_ns)
 
 
 @kernel
@@ -242,8 +239,7 @@ def _run_all(
     count = 0
     for row in range(len(vehicles)):
         vehicle = vehicles[row]
-        up, down = row_of(vehicle.system_id, LINK_UP), row_of(vehicle.system_id, LINK_DOWN)
-        first_ns = leaves_ns(vehicle, links[up], links[down])
+        first_ns = leaves_ns(vehicle, links[row_of(row, LINK_UP)], links[row_of(row, LINK_DOWN)])
         if first_ns > now_ns:
             continue
         if not vehicle.plain or not run_at(vehicles, links, entries, frames, draws, row, now_ns):
@@ -264,19 +260,18 @@ def leave_all(
 ) -> int:
     """Take datagrams that leave their up links by now; returns how many, at most as many as `leaving` has rows.
 
-    `leaving` is (system id, begin, end, time) of each, and `data` holds their bytes.
+    `leaving` is (row, begin, end, time) of each, and `data` holds their bytes.
     """
     count = end = 0
     for row in range(len(vehicles)):
-        system_id = vehicles[row].system_id
-        link = links[row_of(system_id, LINK_UP)]
+        link = links[row_of(row, LINK_UP)]
         while link.next_due_ns <= now_ns and link.under_way > 0:
             if count == len(leaving):
                 return count
             entry = take(link, entries)
             begin, end = end, end + entries[entry].size
             copy_bytes(data, begin, frames[entry], 0, entries[entry].size)
-            leaving[count, 0], leaving[count, 1], leaving[count, 2] = system_id, begin, end
+            leaving[count, 0], leaving[count, 1], leaving[count, 2] = row, begin, end
             leaving[count, 3] = entries[entry].due_ns
             count += 1
     return count
@@ -287,8 +282,7 @@ def next_leaving_ns(vehicles: Records, links: Records) -> int:
     """The earliest instant at which a datagram of any vehicle can leave."""
     first_ns = NEVER_NS
     for row in range(len(vehicles)):
-        system_id = vehicles[row].system_id
-        up, down = links[row_of(system_id, LINK_UP)], links[row_of(system_id, LINK_DOWN)]
+        up, down = links[row_of(row, LINK_UP)], links[row_of(row, LINK_DOWN)]
         first_ns = min(first_ns, leaves_ns(vehicles[row], up, down))
     return first_ns
 

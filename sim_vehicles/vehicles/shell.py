@@ -12,6 +12,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from scenarios import schema
+from scenarios.networks import wire_id
 from sim_vehicles.links.truth import ACTED, SAMPLED, Record
 from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.services import mavlink
@@ -60,7 +61,7 @@ class Radio:
         place: Place | None = None,
     ) -> None:
         self.place = place or place_in(new_vehicles(1))
-        self.place.columns["system_id"][self.place.row] = own.system_id
+        self.place.columns["system_id"][self.place.row] = wire_id(own.system_id)
         self.system_id = own.system_id
         self.start_ns = start_ns
         self.counters: Counter[str] = Counter()
@@ -271,7 +272,7 @@ class Shell(Generic[Flown]):
                 self._take_heartbeat(source, message, time_ns)
             elif isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
-            elif not mavlink.is_for(message, self.system_id):
+            elif not mavlink.is_for(message, self.radio.encoder.system_id):
                 counters["ignored_not_addressed"] += 1
             elif authority.obeys(source, message, time_ns):
                 self._obey(message, self.craft.acts_at(time_ns))
@@ -290,7 +291,7 @@ class Shell(Generic[Flown]):
             self.craft.hear_heartbeat(time_ns)
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
-        if message.target_system not in (0, self.system_id):
+        if message.target_system not in (0, self.radio.encoder.system_id):
             self.radio.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
             self.radio.counters["timesync_requests"] += 1

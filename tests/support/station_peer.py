@@ -4,15 +4,15 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Address, Datagram, Outgoing
 
-HOME = ("127.0.0.1", 5001)
+HOME = ("127.0.0.1", 5001, 0)
 
 
 class Peer:
     """One vehicle played by pymavlink: what it says and what it was told."""
 
-    def __init__(self, system_id: int, address: tuple[str, int] = HOME) -> None:
+    def __init__(self, system_id: int, address: Address = HOME) -> None:
         self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
         self.address = address
 
@@ -25,7 +25,7 @@ class Peer:
         return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
 
 
-def messages(outgoing: list[Outgoing], kind: str, to: tuple[str, int] = HOME) -> list[Any]:
+def messages(outgoing: list[Outgoing], kind: str, to: Address = HOME) -> list[Any]:
     """The messages of one kind sent to an address, as pymavlink reads them."""
     parser: Any = dialect.MAVLink(None)
     read = [parser.parse_char(data) for data, address in outgoing if address == to]

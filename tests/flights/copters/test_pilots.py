@@ -100,7 +100,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
             break
     vehicle = station.vehicles[2]
     assert vehicle.taken_over
-    vehicle.address = ("elsewhere", 3)
+    vehicle.address = ("elsewhere", 3, 0)
     vehicle.begin_anew()
     told = [vehicle.next_frame(station.next_event_ns + k * SECOND // 50) for k in range(500)]
     numbers = {parse(frame).command for frame in told if frame is not None}
@@ -198,7 +198,7 @@ def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
 
 def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     vehicle = RemoteVehicle(3, startup=LaunchedStartup(50.0))
-    vehicle.address = ("127.0.0.1", 3)
+    vehicle.address = ("127.0.0.1", 3, 0)
 
     def heartbeat(mode: int, *, armed: bool, at_s: float) -> tuple[int, bool]:
         vehicle.heartbeat((mode, 2, 3, 0x80 if armed else 0, 4, 3), round(at_s * SECOND))

@@ -20,7 +20,7 @@ def requested(frame: bytes | None) -> float:
 def asked_twice() -> RemoteVehicle:
     """A vehicle that was asked twice for positions, before the first answer came."""
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0, target_hz=10.0))
-    vehicle.address = "127.0.0.1", 1
+    vehicle.address = "127.0.0.1", 1, 0
     vehicle.clock.rtt_ns = 3 * NS_PER_S // 10
     assert requested(vehicle.next_frame(0)) == mavlink.LOCAL_POSITION_NED
     assert requested(vehicle.next_frame(NS_PER_S)) == mavlink.LOCAL_POSITION_NED

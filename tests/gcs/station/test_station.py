@@ -125,7 +125,7 @@ def test_unknown_system_id_is_counted_and_not_answered() -> None:
 
 
 def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
-    station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666))
+    station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666, 0))
     station.step([peer.heartbeat(S)], S)
     station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)
     assert station.vehicles[1].address == HOME

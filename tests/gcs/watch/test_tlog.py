@@ -31,7 +31,7 @@ def found(data: bytes) -> list[tuple[int, bytes]]:
 
 def test_what_a_run_writes_is_read_back_with_its_times(tmp_path: Path) -> None:
     writer = RunWriter(tmp_path)
-    writer.frames([(frame, stamp_us * 1000 + 999) for stamp_us, frame in ENTRIES])
+    writer.frames([(frame, stamp_us * 1000 + 999, ("", 0, 0)) for stamp_us, frame in ENTRIES])
     writer.close()
     log = read_tlog(tmp_path / TLOG_FILE)
     assert [(time_ns, frame.data) for time_ns, frame in log.frames] == [(us * 1000, frame) for us, frame in ENTRIES]

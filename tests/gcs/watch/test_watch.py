@@ -60,14 +60,14 @@ class Watched:
                     self.watch.take(frame, time_ns)
             for system_id, data, time_ns in self.fleet.step(to_vehicles, self.now_ns):
                 for frame in mavlink.decode_either(data, self.watch.counters):
-                    self.watch.take(frame, time_ns, (HOST, system_id))
+                    self.watch.take(frame, time_ns, (HOST, system_id, 0))
             looks = len(self.true_ages_s)
             self.watch.look(self.now_ns)
             if 1 in self.watch.vehicles and len(self.watch.vehicles[1].age_s) > looks:
                 self.true_ages_s += [self._true_age_s()] * (len(self.watch.vehicles[1].age_s) - looks)
             outgoing = self.requests.due(self.watch, self.now_ns)
             self.sent += [data for data, _ in outgoing]
-            to_vehicles = [(system_id, data, self.now_ns) for data, (_, system_id) in outgoing]
+            to_vehicles = [(system_id, data, self.now_ns) for data, (_, system_id, _) in outgoing]
 
     def _true_age_s(self) -> float:
         boot_ms = self.watch.vehicles[1].boot_ns // MS
