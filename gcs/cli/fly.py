@@ -93,8 +93,7 @@ def fly(
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
         if not virtual:
             networks = networks_of(vehicle.system_id for vehicle in scenario.vehicles)
-            guard = options.opened_guard(key, role="station")
-            link = opened.enter_context(options.listening(*at, guard, networks))
+            link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station"), networks))
             options.warn_if_open(link)
             to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands)) if mirror else None
         unmeasured = links_of is None and scenario.control.for_link == "measured"

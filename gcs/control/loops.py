@@ -59,6 +59,11 @@ class Orders(NamedTuple):
 class Loop(Protocol):
     """What depends on where the loop is closed."""
 
+    @property
+    def heeds_deliveries(self) -> bool:
+        """Whether `delivered` does anything."""
+        ...
+
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         """The station's share of each vehicle's command, without the lost ones: see `law.feedback_law`."""
         ...
@@ -103,6 +108,8 @@ def steady_loop(plan: FlightPlan) -> Loop:
 class GroundLoop:
     """The station closes every loop: it sends each vehicle its whole command."""
 
+    heeds_deliveries = False
+
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
 
@@ -136,6 +143,8 @@ class GroundLoop:
 
 class PredictingGroundLoop:
     """The ground loop, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
+
+    heeds_deliveries = True
 
     def __init__(self, plan: FlightPlan) -> None:
         self._ground = GroundLoop(plan)
@@ -177,6 +186,8 @@ class PredictingGroundLoop:
 
 class StreamedLoop:
     """Vehicles close loops of their own: the station uploads their gains and streams what they cannot know."""
+
+    heeds_deliveries = False
 
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
@@ -228,6 +239,8 @@ class StreamedLoop:
 
 class PredictingStreamedLoop:
     """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.predicted_stream`)."""
+
+    heeds_deliveries = True
 
     def __init__(self, plan: FlightPlan) -> None:
         self._streamed = StreamedLoop(plan)

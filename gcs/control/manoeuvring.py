@@ -38,6 +38,8 @@ def loop_of(plan: FlightPlan, law: FlownLaw | None = None) -> Loop:
 class ManoeuvringLoop:
     """See `gcs.control.loops.Loop`; `inner` is the loop that closes around the planned motion."""
 
+    heeds_deliveries = True
+
     def __init__(self, plan: FlightPlan, inner: Loop) -> None:
         self._inner, self._row = inner, plan.formation.row
         self._motion = PlannedMotion(plan.scenario, plan.formation)

@@ -99,6 +99,8 @@ class FlownLaw:
 class OwnLawLoop:
     """The ground loop with commands from the user's own law. See `gcs.control.loops.Loop`."""
 
+    heeds_deliveries = False
+
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
         ground, self._plan, self._law = GroundLoop(plan), plan, law
         self.delivered, self.remember, self.set_points = ground.delivered, ground.remember, ground.set_points

@@ -55,7 +55,7 @@ LEAST_SAMPLES = 5
 LATEST_NS = 1 << 62
 """Largest plausible clock reading, 146 years; a clock set back may be negative. Differences fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
-_MOST_PENDING = 4096
+MOST_PENDING = 4096
 """Most requests that are remembered without a reply: 20 s at 200 Hz."""
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
@@ -606,7 +606,7 @@ def new_clocks(n: int) -> Clocks:
     known["rtt_ns"] = known["down_ns"] = UNKNOWN
     known["newest_boot_ns"] = known["state_low_ns"] = known["fitted_ns"] = _LONG_AGO_NS
     known["ways_ns"], known["tilt"], known["since_ns"] = LATEST_NS, _TILT, -1
-    return Clocks(known, np.zeros((n, WINDOW), EXCHANGES), np.zeros((n, _MOST_PENDING), np.int64))
+    return Clocks(known, np.zeros((n, WINDOW), EXCHANGES), np.zeros((n, MOST_PENDING), np.int64))
 
 
 class VehicleClock:

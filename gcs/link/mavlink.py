@@ -274,6 +274,7 @@ _SET_POINT_BYTES = _LAYOUTS[SET_POSITION_TARGET_LOCAL_NED].length
 _HEADER_BYTES = _HEADER.size
 _POSITION_EXTRA, _TIMESYNC_EXTRA = CRC_EXTRA[LOCAL_POSITION_NED][0], CRC_EXTRA[TIMESYNC][0]
 _SET_POINT_EXTRA = CRC_EXTRA[SET_POSITION_TARGET_LOCAL_NED][0]
+_HEARTBEAT_EXTRA, _GLOBAL_EXTRA = CRC_EXTRA[HEARTBEAT][0], CRC_EXTRA[GLOBAL_POSITION_INT][0]
 
 
 def _crc_step(crc: int, byte: int) -> int:
@@ -297,13 +298,26 @@ def checksum(data: Array, begin: int, end: int, extra: int) -> int:
 
 @kernel
 def usual_message(data: Array, begin: int, end: int) -> int:
-    """The id of the message in a datagram that holds one valid, unsigned LOCAL_POSITION_NED or TIMESYNC; else -1."""
+    """The id of the message in a datagram that holds one valid, unsigned frame of a usual message; else -1.
+
+    Usual are LOCAL_POSITION_NED, TIMESYNC, HEARTBEAT and GLOBAL_POSITION_INT.
+    """
     if end - begin < _OVERHEAD or data[begin] != MAGIC or data[begin + 2] or end - begin != _OVERHEAD + data[begin + 1]:
         return -1
     msg_id = int64(data[begin + 7])
-    if data[begin + 8] or data[begin + 9] or msg_id not in (LOCAL_POSITION_NED, TIMESYNC):
+    if data[begin + 8] or data[begin + 9]:
         return -1
-    crc = checksum(data, begin + 1, end - 2, _POSITION_EXTRA if msg_id == LOCAL_POSITION_NED else _TIMESYNC_EXTRA)
+    if msg_id == LOCAL_POSITION_NED:
+        extra = _POSITION_EXTRA
+    elif msg_id == TIMESYNC:
+        extra = _TIMESYNC_EXTRA
+    elif msg_id == HEARTBEAT:
+        extra = _HEARTBEAT_EXTRA
+    elif msg_id == GLOBAL_POSITION_INT:
+        extra = _GLOBAL_EXTRA
+    else:
+        return -1
+    crc = checksum(data, begin + 1, end - 2, extra)
     return msg_id if crc == int64(data[end - 2]) | int64(data[end - 1]) << 8 else -1
 
 

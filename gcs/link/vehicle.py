@@ -46,7 +46,7 @@ _NOBODY = -1
 """In place of the number of an address."""
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
-_FORGET_NUMBERS_NS = 3 * NS_PER_S
+FORGET_NUMBERS_NS = 3 * NS_PER_S
 SILENCE_S = 1.5
 """A vehicle without telemetry for this long is lost: it is sent no more set-points, and the others fly without it. One
 that sends nothing at all for this long may be accepted from another address."""
@@ -59,6 +59,9 @@ LINK = np.dtype(
         ("address", "i8"),  # place among `Links.addresses`, or _NOBODY
         ("heard_ns", "i8"),  # newest valid frame
         ("first_heard_ns", "i8"),  # first one, or 0
+        ("launched", "?"),  # it has no autopilot, so that only changes of its heartbeats matter, and no global position
+        ("heartbeat_ns", "i8"),  # newest heartbeat
+        ("heartbeat", "u8"),  # the first 8 bytes of a heartbeat that would change nothing; 0: none
         ("newest", "?"),  # the last frame taken in was sent after all the others
         ("told", "i8"),  # bits of what was reported of the order of its frames: 1 << LATE, 1 << DUPLICATE
         ("left_out", "?"),  # see `RemoteVehicle`
@@ -83,13 +86,21 @@ class Links(NamedTuple):
     counters: Records
     addresses: dict[Address, int]
     """A number for each address that vehicles have sent from."""
+    to: list[Address | None]
+    """The address of each vehicle."""
 
 
 def new_links(n: int) -> Links:
     """Links over which nothing has been heard."""
     known = np.zeros(n, LINK)
     known["address"], known["newest"], known["lag_jumps"] = _NOBODY, True, -1
-    return Links(known, new_clocks(n), new_counters(n), {})
+    return Links(known, new_clocks(n), new_counters(n), {}, [None] * n)
+
+
+def addressed(links: Links, rows: Sequence[int], frames: Sequence[bytes]) -> list[Outgoing]:
+    """Frames to the vehicles in these rows, whose addresses are known."""
+    to: list[Any] = links.to
+    return [*zip(frames, [to[row] for row in rows], strict=True)]
 
 
 def requests_to(links: Links, rows: Sequence[int], now_ns: int) -> list[bytes]:
@@ -162,6 +173,9 @@ class RemoteVehicle:
     """Whether the last frame taken in was sent after all the others."""
     left_out = Cell[bool]()
     """Whether the formation flies without it because it did not become ready in time."""
+    heartbeat_ns = Cell[int]()
+    """When the newest heartbeat came."""
+    _launched, _heartbeat = Cell[bool](), Cell[int]()
     _local_ms, _local_is_new = Cell[int](), Cell[bool]()
     _told, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
 
@@ -181,8 +195,6 @@ class RemoteVehicle:
         """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter."""
         self._links, self._row = links or new_links(1), row
         self._columns = Columns(self._links.known)
-        self._address: Address | None = None
-        self.heartbeat_ns = 0  # newest heartbeat
         self.frames = SequenceCounter(self._links.counters, row)
         self.clock = VehicleClock(self._links.clocks, row)
         self.armed = False
@@ -195,6 +207,7 @@ class RemoteVehicle:
         reports that it is guided; until then the station asks it for telemetry and commands nothing."""
         self.startup = ExternalStartup(startup) if external else startup
         self.kind = startup.kind
+        self._launched = not self.kind.piloted
         self._has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
         """When the first heartbeat after a long silence arrived. It may be a replay: its number does not show that."""
@@ -214,11 +227,11 @@ class RemoteVehicle:
 
     @property
     def address(self) -> Address | None:
-        return self._address
+        return self._links.to[self._row]
 
     @address.setter
     def address(self, address: Address | None) -> None:
-        numbers, self._address = self._links.addresses, address
+        numbers, self._links.to[self._row] = self._links.addresses, address
         number = _NOBODY if address is None else numbers.setdefault(address, len(numbers))
         self._links.known["address"][self._row] = number
 
@@ -294,10 +307,10 @@ class RemoteVehicle:
             self._told |= 1 << order
             self.report_order(order)
         self.newest = order == NEW
-        if heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
+        if heartbeat and now_ns - self.heartbeat_ns > FORGET_NUMBERS_NS:
             self._doubtful_ns = now_ns
         replayed = order == DUPLICATE or (heartbeat and order == LATE)
-        if replayed and heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
+        if replayed and heartbeat and now_ns - self.heartbeat_ns > FORGET_NUMBERS_NS:
             self.frames.restart()
             return False
         if heartbeat and not replayed:
@@ -350,6 +363,7 @@ class RemoteVehicle:
         elif was_guided and not self.guided and not critical:
             self._report("vehicle", f"left {self.kind.guided_name}", self.system_id)
         self.critical = critical
+        self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
         """Notice from a reported mode that somebody else has taken the vehicle over, or given it back.
@@ -362,7 +376,7 @@ class RemoteVehicle:
             return
         if mode == kind.guided_mode:
             self._has_been_guided = True
-            self.taken_over = self.taken_over and now_ns - self._doubtful_ns < _FORGET_NUMBERS_NS
+            self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
         elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
         elif before == kind.guided_mode:
@@ -410,6 +424,7 @@ class RemoteVehicle:
         if command == ARM_DISARM and self.startup.arming_refusals > 1:
             self._report("vehicle", f"arms after {self.startup.arming_refusals} refusals", self.system_id)
         self.startup.accepted(command, waiting.parameters, now_ns)
+        self._heartbeat = 0
         if command in (SET_MODE, ARM_DISARM):
             self._outdated.append((now_ns, self.custom_mode, self.armed))
         if command == SET_MODE:

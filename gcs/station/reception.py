@@ -1,11 +1,12 @@
 """Takes datagrams in: what vehicles sent, and what follows from it for their clocks, their states and their start-up.
 
-Nearly all datagrams hold one LOCAL_POSITION_NED, or the reply to a TIMESYNC request. One kernel takes all of these, up
-to the first datagram that is anything else; that one is read frame by frame, by the same kernels where they apply.
+Nearly all datagrams hold one LOCAL_POSITION_NED, the reply to a TIMESYNC request, or a heartbeat like the last one. One
+kernel takes all of these, up to the first datagram that is anything else; that one is read frame by frame, by the same
+kernels where they apply.
 """
 
 from array import array
-from collections import Counter, defaultdict, deque
+from collections import Counter
 from collections.abc import Sequence
 from itertools import accumulate
 from math import isfinite, nan
@@ -18,11 +19,18 @@ from gains.core.arrays import FloatArray
 from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
-from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
+from gcs.link.clocks import MOST_PENDING, UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
 from gcs.link.datagram import Arrival, Datagram, Logged, Outgoing
-from gcs.link.mavlink import TIMESYNC, float_at, unsigned_at, usual_message
+from gcs.link.mavlink import (
+    HEARTBEAT,
+    LOCAL_POSITION_NED,
+    TIMESYNC,
+    float_at,
+    unsigned_at,
+    usual_message,
+)
 from gcs.link.sequence import DUPLICATE, NEW, count
-from gcs.link.vehicle import RemoteVehicle, Report, delivery_ns
+from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns
 from gcs.station.fleet_kind import FleetKind
 from scenarios.kernel import Array, Records, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
@@ -44,10 +52,10 @@ REPORTED = np.dtype(
     ]
 )
 """What came with a vehicle's newest state."""
-_ORDER, _REPLY, _JUMP, _EXCHANGE = range(4)
-_NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8"), ("delivery_ns", "i8")])
-"""What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _REPLY: note a round trip
-(value_ns) of a request sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns."""
+_ORDER, _DELIVERY, _JUMP, _EXCHANGE = range(4)
+_NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8")])
+"""What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _DELIVERY: tell the loop the
+one-way delay (value_ns) of what was sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns."""
 _NEWS_OF_A_FRAME = 3
 
 
@@ -65,6 +73,9 @@ class Tables(NamedTuple):
     telemetry_ns: NDArray[np.int64]
     """When the newest state came."""
     frame_ned_m: FloatArray
+    fresh_ns: NDArray[np.int64]
+    """Round trips that no tick holds yet, oldest first, and how many in each row."""
+    fresh_counts: NDArray[np.int64]
     news: Records
     news_count: NDArray[np.int64]
     """How many of `news` are new, (1,)."""
@@ -78,6 +89,8 @@ class Now(NamedTuple):
     """When the flight's clock began."""
     period_ns: int
     """Least time between two exchanges because of refused states."""
+    tells: bool
+    """Whether the loop heeds deliveries."""
 
 
 def new_reported(n: int) -> Records:
@@ -104,9 +117,8 @@ class Reception:
         self.counters: Counter[str] = Counter()
         """Frames that were refused, by reason."""
         self.touched: set[int] = set()
-        """Vehicles that have sent anything else than positions and replies since `touched` was last cleared."""
-        self._fresh_rtt_s = defaultdict[int, deque[float]](deque)
-        """By row, the round trips that no tick holds yet."""
+        """Vehicles that have sent anything that is not usual since `touched` was last cleared."""
+        self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
         self._row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
@@ -119,16 +131,12 @@ class Reception:
         news = np.zeros(max(64, 2 * _NEWS_OF_A_FRAME * datagrams), _NEWS)
         self._tables = Tables(
             links.known, *links.clocks, links.counters, history.reports, history.counts, self.reported,
-            self.telemetry_ns, self._fleet.frame_ned_m, news, np.zeros(1, np.int64),
+            self.telemetry_ns, self._fleet.frame_ned_m, *self._fresh, news, np.zeros(1, np.int64),
         )  # fmt: skip
 
     def fresh_rtt_s(self) -> FloatArray:
         """For each vehicle the oldest completed round trip that was not returned before; NaN if there is none."""
-        found_s = np.full(len(self._row), nan)
-        for row, fresh_s in [*self._fresh_rtt_s.items()]:
-            found_s[row] = fresh_s.popleft()
-            if not fresh_s:
-                del self._fresh_rtt_s[row]
+        found_s: FloatArray = _take_fresh(*self._fresh)
         return found_s
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
@@ -147,7 +155,7 @@ class Reception:
         numbers, known = self._fleet.links.addresses, -1
         stream, table = np.frombuffer(b"".join(data), np.uint8), np.empty((0, 0), np.int64)
         networks = np.empty(0, np.int64)
-        now = Now(now_ns, self._start_ns, self._period_ns)
+        now = Now(now_ns, self._start_ns, self._period_ns, self._fleet.loop.heeds_deliveries)
         place = 0
         while place < len(datagrams):
             if len(numbers) != known:  # at first, and when a vehicle has sent from another address
@@ -238,15 +246,17 @@ class Reception:
 
     def _follow_up(self, outgoing: list[Outgoing]) -> None:
         """Do what the kernels have left to do."""
-        news = self._tables.news[: self._tables.news_count[0]].tolist()
+        count = self._tables.news_count.item()
+        if not count:
+            return
+        news = self._tables.news[:count].tolist()
         self._tables.news_count[0] = 0
-        for kind, row, value_ns, sent_ns, delivered_ns in news:
+        for kind, row, value_ns, sent_ns in news:
             vehicle = self._fleet.vehicles[row]
             if kind == _ORDER:
                 vehicle.report_order(value_ns)
-            elif kind == _REPLY:
-                self._fresh_rtt_s[row].append(value_ns * 1e-9)
-                self._fleet.loop.delivered(row, max(0, delivered_ns), sent_ns)
+            elif kind == _DELIVERY:
+                self._fleet.loop.delivered(row, max(0, value_ns), sent_ns)
             elif kind == _JUMP:
                 self.touched.add(row)
                 vehicle.begin_anew()
@@ -256,10 +266,24 @@ class Reception:
 
 
 @kernel
-def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int, delivered_ns: int) -> None:
+def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int) -> None:
     news = tables.news[tables.news_count[0]]
-    news.kind, news.row, news.value_ns, news.sent_ns, news.delivery_ns = kind, row, value_ns, sent_ns, delivered_ns
+    news.kind, news.row, news.value_ns, news.sent_ns = kind, row, value_ns, sent_ns
     tables.news_count[0] += 1
+
+
+@kernel
+def _take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
+    """For each vehicle its oldest fresh round trip in s, which is fresh no more; NaN if there is none."""
+    found_s = np.empty(len(counts))
+    for row in range(len(counts)):
+        found_s[row] = nan
+        if counts[row]:
+            found_s[row] = fresh_ns[row, 0] * 1e-9
+            counts[row] -= 1
+            for place in range(counts[row]):
+                fresh_ns[row, place] = fresh_ns[row, place + 1]
+    return found_s
 
 
 @kernel
@@ -275,44 +299,69 @@ def _take_usual(
     for place in range(first, len(ends)):
         begin, end = ends[place - 1] if place else 0, ends[place]
         msg_id = usual_message(stream, begin, end)
-        if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
-            return place
-        if senders[place] < 0:
+        if msg_id < 0 or senders[place] < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
             return place
         row = row_of[networks[senders[place]], stream[begin + 5]]
         if row < 0 or tables.links[row].address != senders[place]:
             return place
-        payload, payload_end = begin + _HEADER_BYTES, end - _CHECKSUM_BYTES
-        tc1_ns, state = 0, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        if msg_id == TIMESYNC:
-            tc1_ns = int64(unsigned_at(stream, payload, 8, payload_end))
-            if tc1_ns == 0:
-                return place  # a request
-        else:
-            state = (
-                float_at(stream, payload + 4, payload_end), float_at(stream, payload + 8, payload_end),
-                float_at(stream, payload + 12, payload_end), float_at(stream, payload + 16, payload_end),
-                float_at(stream, payload + 20, payload_end), float_at(stream, payload + 24, payload_end),
-            )  # fmt: skip
-            if not isfinite(sum(state)):
-                return place
-        link = tables.links[row]
-        link.heard_ns = received_ns[place]
-        link.first_heard_ns = link.first_heard_ns or received_ns[place]
-        order = count(tables.counters[row], int64(stream[begin + 4]), received_ns[place])
-        if order != NEW and not link.told >> order & 1:
-            link.told |= 1 << order
-            _note(tables, _ORDER, row, order, 0, 0)
-        link.newest = order == NEW
-        if order == DUPLICATE:
-            continue
-        if msg_id == TIMESYNC:
-            ts1_ns = int64(unsigned_at(stream, payload + 8, 8, payload_end))
-            _take_reply(tables, row, tc1_ns, ts1_ns, received_ns[place], now)
-        else:
-            boot_ms = int64(unsigned_at(stream, payload, 4, payload_end))
-            _take_position(tables, row, boot_ms, state, received_ns[place], queued_ns[place], now)
+        if not _take_frame(tables, row, msg_id, stream, begin, end, received_ns[place], queued_ns[place], now):
+            return place
     return len(ends)
+
+
+@kernel
+def _take_frame(
+    tables: Tables,
+    row: int,
+    msg_id: int,
+    stream: Array,
+    begin: int,
+    end: int,
+    received_ns: int,
+    queued_ns: int,
+    now: Now,
+) -> bool:
+    """Take in a frame of a usual message; False, and nothing is done, if more may follow from it than kernels know."""
+    link, payload, payload_end = tables.links[row], begin + _HEADER_BYTES, end - _CHECKSUM_BYTES
+    state = _state_at(stream, payload, payload_end)
+    tc1_ns = int64(unsigned_at(stream, payload, 8, payload_end))
+    if msg_id == LOCAL_POSITION_NED:
+        known = isfinite(sum(state))
+    elif msg_id == TIMESYNC:
+        known = tc1_ns != 0  # a reply
+    elif msg_id == HEARTBEAT:
+        same = unsigned_at(stream, payload, 8, payload_end) == link.heartbeat
+        known = link.launched and same and received_ns - link.heartbeat_ns <= FORGET_NUMBERS_NS
+    else:
+        known = link.launched
+    if not known:
+        return False
+    link.heard_ns = received_ns
+    link.first_heard_ns = link.first_heard_ns or received_ns
+    order = count(tables.counters[row], int64(stream[begin + 4]), received_ns)
+    if order != NEW and not link.told >> order & 1:
+        link.told |= 1 << order
+        _note(tables, _ORDER, row, order, 0)
+    link.newest = order == NEW
+    if order == DUPLICATE:
+        return True
+    if msg_id == LOCAL_POSITION_NED:
+        boot_ms = int64(unsigned_at(stream, payload, 4, payload_end))
+        _take_position(tables, row, boot_ms, state, received_ns, queued_ns, now)
+    elif msg_id == TIMESYNC:
+        _take_reply(tables, row, tc1_ns, int64(unsigned_at(stream, payload + 8, 8, payload_end)), received_ns, now)
+    elif msg_id == HEARTBEAT and order == NEW:
+        link.heartbeat_ns = received_ns
+    return True
+
+
+@kernel
+def _state_at(stream: Array, payload: int, end: int) -> tuple[float, ...]:
+    """Position and velocity, north, east and down, in the payload of a LOCAL_POSITION_NED."""
+    return (
+        float_at(stream, payload + 4, end), float_at(stream, payload + 8, end), float_at(stream, payload + 12, end),
+        float_at(stream, payload + 16, end), float_at(stream, payload + 20, end), float_at(stream, payload + 24, end),
+    )  # fmt: skip
 
 
 @kernel
@@ -331,7 +380,7 @@ def _take_position(
         if not (clock.lost or clock.doubtful_state):
             tables.telemetry_ns[row] = received_ns  # heard before the first exchange
         elif now.now_ns - clock.asked_ns >= now.period_ns:
-            _note(tables, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0, 0)
+            _note(tables, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0)
         return
     origin = tables.frame_ned_m[row]
     north, east = state[0] + origin[0], state[1] + origin[1]
@@ -351,9 +400,13 @@ def _take_reply(tables: Tables, row: int, tc1_ns: int, ts1_ns: int, received_ns:
     jumps = clock.jumps
     rtt_ns = reply(clock, tables.exchanges[row], tables.pending_ns[row], tc1_ns, ts1_ns, received_ns)
     if rtt_ns != UNKNOWN:
-        key_ms = (ts1_ns - now.start_ns) // 1_000_000
-        delivered_ns = delivery_ns(link, clock, key_ms, now.start_ns + key_ms * 1_000_000)
-        _note(tables, _REPLY, row, rtt_ns, ts1_ns, delivered_ns)
+        if tables.fresh_counts[row] < len(tables.fresh_ns[row]):
+            tables.fresh_ns[row, tables.fresh_counts[row]] = rtt_ns
+            tables.fresh_counts[row] += 1
+        if now.tells:
+            key_ms = (ts1_ns - now.start_ns) // 1_000_000
+            delivered_ns = delivery_ns(link, clock, key_ms, now.start_ns + key_ms * 1_000_000)
+            _note(tables, _DELIVERY, row, delivered_ns, ts1_ns)
     if clock.jumps != jumps:
         tables.report_counts[row] = 0
-        _note(tables, _JUMP, row, 0, 0, 0)
+        _note(tables, _JUMP, row, 0, 0)

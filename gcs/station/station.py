@@ -10,7 +10,7 @@ from math import hypot, isfinite, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gcs.control.law import nearest
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
@@ -21,7 +21,7 @@ from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Arrival, Outgoing
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import SILENCE_S, RemoteVehicle, requests_to
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle, addressed, requests_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
@@ -147,8 +147,8 @@ class Station:
             away = dict.fromkeys(self._monitor.away, False)
             away |= {row: why in PILOTED for row, why in enumerate(self._absent) if why}
             self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
-        newest_ns = sent_ns[-1] if sent_ns else self._now_ns
-        own_ns = np.array([newest_ns if index < 0 else sent_ns[index] for index in tick.set_point_indices])
+        # the last one, which index -1 finds, is that of vehicles that were sent none
+        own_ns = np.array([*sent_ns, sent_ns[-1] if sent_ns else self._now_ns])[tick.set_point_indices]
         rows, self._used_s = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
         return rows
 
@@ -192,17 +192,14 @@ class Station:
         self._tick_count += 1 + behind
         return tick
 
-    def _send_set_points(self, points: Records, key_ms: int, outgoing: list[Outgoing]) -> list[int]:
+    def _send_set_points(self, points: Records, key_ms: int, outgoing: list[Outgoing]) -> IntArray:
         """Add the set-points to the datagrams to be sent; returns their indices there, -1 for none."""
         links = self._fleet.links.known
         rows = (points["sent"] & (links["address"] >= 0)).nonzero()[0]
         frames = mavlink.set_point_frames(points, rows, links["sequence"], self._targets, key_ms)
-        indices = [-1] * len(points)
-        for row, frame in zip(rows.tolist(), frames, strict=True):
-            address = self.vehicles[row].address
-            assert address is not None
-            indices[row] = len(outgoing)
-            outgoing.append((frame, address))
+        indices = np.full(len(points), -1)
+        indices[rows] = np.arange(len(outgoing), len(outgoing) + len(rows))
+        outgoing += addressed(self._fleet.links, rows.tolist(), frames)
         return indices
 
     def _tolerances(self, assumed_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -327,11 +324,9 @@ class Station:
             rows.append(self._timesync_row)
             self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
             self._next_timesync_ns += self._timesync_spacing_ns
-        known = [row for row in rows if self.vehicles[row].address is not None]
-        for row, frame in zip(known, requests_to(self._fleet.links, known, self._now_ns), strict=True):
-            address = self.vehicles[row].address
-            assert address is not None
-            outgoing.append((frame, address))
+        links = self._fleet.links
+        known = [row for row in rows if links.to[row] is not None]
+        outgoing += addressed(links, known, requests_to(links, known, self._now_ns))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""

@@ -1,13 +1,12 @@
 """Fills the rows of the tick record from what the station knows at a tick."""
 
-from collections.abc import Sequence
 from math import nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.control.tick import TICK, TickArray
 from gcs.link.clocks import UNKNOWN, bound_at_ns, estimate_of, offset_at_ns
@@ -46,7 +45,7 @@ class Tick(NamedTuple):
     due_ns: int
     key_ms: int
     judged: Judged
-    set_point_indices: Sequence[int]
+    set_point_indices: IntArray
     """For each vehicle the index of its set-point among the datagrams of the step; -1 if it was sent none."""
 
 

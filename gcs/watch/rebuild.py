@@ -285,7 +285,8 @@ class _Rebuilding:
             np.array([own.shorter_s for own in tolerated]), np.array([own.longer_s for own in tolerated]),
             self._repetitions.repeated_s(controls["used_ns"], due_ns),
         )  # fmt: skip
-        tick = Tick(round((due_ns - self._start_ns) / self._period_ns), time_s, due_ns, key_ms, judged, ())
+        number = round((due_ns - self._start_ns) / self._period_ns)
+        tick = Tick(number, time_s, due_ns, key_ms, judged, np.empty(0, np.int64))
         rows, _ = tick_rows(tick, self._fleet.links, near.distance_m, np.array([own_ns for own_ns, _ in sent]))
         self._rows.append(rows)
 

@@ -117,6 +117,7 @@ class Fleet:
             self._members[own.system_id] = _Member(row, vehicle, up, down, signed[own.system_id] if signed else None)
             self._columns["plain"][row] = craft.is_plain and up.plain and not signed and not self._in_order
         self._in_rows, self.system_ids = [*self._members.values()], tuple(self._members)
+        self._rows = {system_id: row for row, system_id in enumerate(self._members)}
         for member in self._in_rows:
             self._plan(member)
         if self._sector is not None:
@@ -178,8 +179,8 @@ class Fleet:
         if self._in_order:
             self._run_in_order(received, now_ns)
             received = ()
-        entering = list(received)
-        numbers = [number for key, data, time_ns in entering for number in (self._members[key].row, len(data), time_ns)]
+        entering, row_of, ids = list(received), self._rows, self.system_ids
+        numbers = [number for key, data, time_ns in entering for number in (row_of[key], len(data), time_ns)]
         data = np.frombuffer(b"".join([data for _, data, _ in entering]), np.uint8)
         edge = data, np.array(numbers, np.int64), self._waiting, self._leaving, self._leaving_data
         entered, waiting, leaving = step_all(*self._arrays(), *edge, 0, now_ns)
@@ -194,7 +195,6 @@ class Fleet:
         while leaving:
             rows: list[list[int]] = self._leaving[:leaving].tolist()
             left = self._leaving_data[: rows[-1][2]].tobytes()
-            ids = self.system_ids
             out += [(ids[row], left[begin:end], due_ns) for row, begin, end, due_ns in rows]
             if leaving < len(self._leaving):
                 break
