@@ -2,6 +2,7 @@
 
 import resource
 import signal
+import struct
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from sim_vehicles.links.truth import ACTED, CORRUPTED, DTYPE, DUPLICATE, LINK_UP
 
 ROWS: list[Row] = [
     (SAMPLED, 1, 2**32 - 1, 10, 10, 10, 0, 0),
-    (ACTED, 250, 0, 2**62, 5, -7, 0, 0),
+    (ACTED, 9250, 0, 2**62, 5, -7, 0, 0),
     (LINK_UP, 3, 32, 30, 10, 29, DUPLICATE | CORRUPTED, 7),
 ]
 
@@ -25,6 +26,12 @@ def write(path: Path, rows: list[Row]) -> None:
 def test_what_is_recorded_is_read_back(tmp_path: Path) -> None:
     write(tmp_path / "truth", ROWS * 1000)
     assert [tuple(row) for row in read_truth(tmp_path / "truth").tolist()] == ROWS * 1000
+
+
+def test_a_log_from_before_there_were_networks_is_read(tmp_path: Path) -> None:
+    rows = [(kind, system_id % 256, *row) for kind, system_id, *row in ROWS]
+    (tmp_path / "truth").write_bytes(b"UAVTRUE2" + b"".join(struct.pack("<BBIqqqBq", *row) for row in rows))
+    assert read_truth(tmp_path / "truth").tolist() == rows
 
 
 def test_what_is_left_out_of_a_record_is_zero(tmp_path: Path) -> None:
