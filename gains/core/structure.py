@@ -69,6 +69,13 @@ def positive_seconds(name: str, value: float) -> float:
     return float(value)
 
 
+def seconds(name: str, value: float) -> float:
+    """`value` if it is finite and not negative, else BadModelError with the name."""
+    if not (np.isfinite(value) and value >= 0.0):
+        raise BadModelError(f"{name} is {value}; a number of seconds >= 0 is wanted")
+    return float(value)
+
+
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     """Index sets of the strongly connected components of the union of the patterns of square matrices.
 

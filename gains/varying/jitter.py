@@ -17,7 +17,7 @@ from gains.core._norms import spectral_norms
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.core.structure import balanced, distinct_blocks, seconds, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
 from gains.varying.bounds import varying_delay_bound
@@ -130,8 +130,7 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
 
 
 def _check(jitter: Jitter) -> None:
-    if not (isfinite(jitter.mean_s) and jitter.mean_s >= 0.0):
-        raise BadModelError(f"mean_s is {jitter.mean_s}; a number of seconds >= 0 is wanted")
+    seconds("mean_s", jitter.mean_s)
     if not 0.0 <= jitter.spread_s <= jitter.mean_s:
         raise BadModelError(f"spread_s is {jitter.spread_s}; 0 to the mean delay of {jitter.mean_s} s is wanted")
     if not jitter.rate >= 0.0:
