@@ -27,7 +27,6 @@ of the whole formation. For disturbances the loop is continuous, R = (s I - A)^{
 noise is that of the sampled loop.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, pi
@@ -35,7 +34,7 @@ from typing import Self
 
 import numpy as np
 
-from gains.core._bracketing import highest
+from gains.core._bracketing import Functions, highest
 from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
@@ -218,7 +217,7 @@ class PredictedFigures:
         mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
         return R @ G + self._ahead @ R @ mismatch
 
-    def _largest(self, function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> float:
+    def _largest(self, function: Functions, omega: FloatArray) -> float:
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
@@ -228,21 +227,18 @@ class PredictedFigures:
         (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
         K = self._fed_forward
 
-        def gain_at(delay_s: float) -> Callable[[FloatArray], FloatArray]:
-            def gain(omega: FloatArray) -> FloatArray:
-                s = 1j * omega[:, np.newaxis, np.newaxis]
-                R = np.linalg.inv(s * np.eye(len(A)) - A)
-                late = np.exp(-s * (delay_s + half_s))
-                seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
-                commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
-                moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
-                return spectral_norms(out @ moved)
-
-            return gain
+        def gain(omega: FloatArray, delay_s: float) -> FloatArray:
+            s = 1j * omega[:, np.newaxis, np.newaxis]
+            R = np.linalg.inv(s * np.eye(len(A)) - A)
+            late = np.exp(-s * (delay_s + half_s))
+            seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
+            commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
+            moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
+            return spectral_norms(out @ moved)
 
         most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
         omega = np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES)[:: self.thinned]
-        return max(self._largest(gain_at(delay_s), omega) for delay_s in self.delays_s)
+        return max(self._largest(lambda at, s=s: gain(at, s), omega) for s in self.delays_s)
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
