@@ -35,15 +35,14 @@ class Block:
 def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
     """The arguments as finite real square matrices of one size; BadModelError names the one that is not."""
     checked: list[FloatArray] = []
-    size = None
     for name, value in matrices.items():
         matrix = real_matrix(name, value)
         if matrix.shape[0] != matrix.shape[1]:
             raise BadModelError(f"{name} has shape {matrix.shape}; a square matrix is wanted")
-        size = matrix.shape[0] if size is None else size
-        if matrix.shape[0] != size:
-            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, as the other matrices")
         checked.append(matrix)
+        size = len(checked[0])
+        if len(matrix) != size:
+            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, as the other matrices")
     return checked
 
 

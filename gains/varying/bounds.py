@@ -87,11 +87,7 @@ def _varying_bound_of_block(now: FloatArray, late: FloatArray, rate: float) -> f
     upper = min(margin_s, _LONGEST)
     if upper > 0.0 and _is_independent_of_length(now, late, rate):
         return inf
-
-    def proved(delay_s: float) -> bool:
-        return _varying_functional_exists(now, late, delay_s, rate)
-
-    bound_s = _bisected(proved, upper)
+    bound_s = _bisected(lambda delay_s: _varying_functional_exists(now, late, delay_s, rate), upper)
     return max(bound_s, _small_gain_of_block(now, late, upper)) if rate == inf else bound_s
 
 
