@@ -6,7 +6,7 @@ d_i} and refines extrema near one. The argument principle counts the roots that 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi
 
@@ -52,7 +52,7 @@ def analyse_mixed_block(block: Block, terms: Sequence[DelayedTerm], leave_out_ze
     """
     known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
     parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
-    delayed = [DelayedTerm(*part) for part in zip(parts.matrices, known_s.tolist(), multiples.tolist(), strict=True)]
+    delayed = [replace(term, matrix=matrix) for term, matrix in zip(terms, parts.matrices, strict=True)]
     passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
     if passage is None and is_singular_for_any_delay(parts.matrices):
         return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)

@@ -129,7 +129,14 @@ class FrontSearch:
         return predicted if route.predicted else tree, lambda point: tree.gains(point).gain_of(self._single)
 
     def _point(self, route: Route, delay_s: float, K: FloatArray, found: Figures) -> FrontPoint:
-        whole = self.figures(self._single, K, delay_s, predicted=route.predicted)
+        single, response = self._single, self.response
+        if route.predicted:
+            whole = PredictedFigures(single, K, self.period_s, delay_s, (delay_s,), response=response)
+            stable_s = whole.window_s
+        else:
+            every = None if response is None else (response,) * single.vehicles
+            whole = LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s, responses=every)
+            stable_s = 0.0, whole.delay_margin_s
         return FrontPoint(
             route=route,
             delay_s=delay_s,
@@ -140,17 +147,8 @@ class FrontSearch:
             string_peak=found.string_peak if route.method == "inclusion" else None,
             spacing_gain_s2=whole.spacing_gain_max_s2,
             noise_gain=whole.noise_gain_max,
-            stable_s=whole.window_s if isinstance(whole, PredictedFigures) else (0.0, whole.delay_margin_s),
+            stable_s=stable_s,
         )
-
-    def figures(
-        self, single: FormationModel, K: FloatArray, delay_s: float, *, predicted: bool
-    ) -> LoopFigures | PredictedFigures:
-        """All figures of gains at a delay."""
-        if predicted:
-            return PredictedFigures(single, K, self.period_s, delay_s, (delay_s,), response=self.response)
-        every = None if self.response is None else (self.response,) * single.vehicles
-        return LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s, responses=every)
 
 
 def efficient(points: Sequence[FrontPoint]) -> list[FrontPoint]:

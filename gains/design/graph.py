@@ -112,26 +112,16 @@ def graph_design(
             "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop wants"
         )
     if wanted.criteria is not None:
-        gain = _searched(single, narrow, bases, wanted, period_s)
+        asked, starts = wanted.criteria, tuple(base.K for base in bases)
+        timing = FlownTiming(inf, period_s)
+        family = PatternGains(single, narrow.mask, starts, asked.at_delay_s, timing, asked.weight, asked.discrete)
+        gain = family.gain(searched(family, replace(wanted, string_peak_max=None))[0])
         return assess(formation, narrow, gain, period_s=period_s, requirement=wanted, method=method)
     base, gain = scaled_to(wanted, margins, bases)
     return assess(
         formation, narrow, gain, period_s=period_s, requirement=wanted, method=method, loss=base.cost_loss,
         solver=base.solver,
     )  # fmt: skip
-
-
-def _searched(
-    single: FormationModel, narrow: Pattern, bases: list[BaseGain], wanted: Requirement, period_s: float
-) -> FloatArray:
-    """The gain that meets a requirement with criteria, searched from base gains."""
-    criteria = wanted.criteria
-    assert criteria is not None
-    timing = FlownTiming(inf, period_s)
-    starts = tuple(base.K for base in bases)
-    family = PatternGains(single, narrow.mask, starts, criteria.at_delay_s, timing, criteria.weight, criteria.discrete)
-    point, _ = searched(family, replace(wanted, string_peak_max=None))
-    return family.gain(point)
 
 
 def lqr_bases(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, PatternGains]:

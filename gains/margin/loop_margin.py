@@ -136,15 +136,15 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     unit = _common_divisor([term.multiple for term in model.terms])
-    steps = [int(term.multiple / unit) for term in model.terms]
-    if max(steps) > _MOST_STEPS:
+    # in the common divisor of the delays; the unknown is that divided by `unit`
+    read = [DelayedTerm(term.matrix, term.fixed_s, int(term.multiple / unit)) for term in model.terms]
+    most = max(term.multiple for term in read)
+    if most > _MOST_STEPS:
         raise BadModelError(
-            f"terms: read delays up to {max(steps)} times their common divisor {unit}*{model.unknown}, "
+            f"terms: read delays up to {most} times their common divisor {unit}*{model.unknown}, "
             f"wanted at most {_MOST_STEPS} times"
         )
-    # in the common divisor of the delays; the unknown is that divided by `unit`
-    parts = zip((term.matrix for term in model.terms), (term.fixed_s for term in model.terms), steps, strict=True)
-    terms, analysis, taken_out = _analysed([DelayedTerm(*part) for part in parts])
+    terms, analysis, taken_out = _analysed(read)
     checked_by, margin_error_s = second_opinions(analysis, terms)
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
