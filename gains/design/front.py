@@ -105,7 +105,7 @@ class FrontSearch:
     @cached_property
     def _graph(self) -> PatternGains:
         """Gains on the pattern, with the LQR gains from which searches start."""
-        return lqr_bases(self.formation, self.pattern)[1]
+        return lqr_bases(self.formation, self.pattern)
 
     def wanted(self, route: Route, delay_s: float) -> Requirement:
         """What is asked of the gains at a delay."""

@@ -124,14 +124,14 @@ def graph_design(
     )  # fmt: skip
 
 
-def lqr_bases(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, PatternGains]:
-    """Return the formation of one axis, and the gains on its pattern that begin with those of the structured LQR.
+def lqr_bases(formation: FormationModel, pattern: Pattern) -> PatternGains:
+    """Return the gains on a pattern, for one axis, that begin with those of the structured LQR.
 
-    The gains have no delay and no period yet. Raises as `graph_design` does.
+    They have no delay and no period yet. Raises as `graph_design` does.
     """
     single, narrow, plant = _narrowed(formation, pattern)
     bases = tuple(K for K, _, _ in _base_gains(plant, narrow, single, "graph-lqr"))
-    return single, PatternGains(single, narrow.mask, bases, None, FlownTiming(inf, 0.0))
+    return PatternGains(single, narrow.mask, bases, None, FlownTiming(inf, 0.0))
 
 
 def _narrowed(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, Pattern, Plant]:
