@@ -24,10 +24,9 @@ from gains.core.errors import BadModelError
 class Block:
     """A diagonal block of the triangular form, which stands for all its equal `copies`.
 
-    `indices` are the states of the first copy; `matrices` are its blocks of the given matrices, in their order.
+    `matrices` are the blocks (n, n) of the given matrices, in their order.
     """
 
-    indices: IntArray
     copies: int
     matrices: tuple[FloatArray, ...]
 
@@ -119,11 +118,7 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
         first.setdefault(key, indices)
         copies[key] = copies.get(key, 0) + 1
     return [
-        Block(
-            indices=indices,
-            copies=copies[key],
-            matrices=tuple(matrix[np.ix_(indices, indices)].astype(np.float64) for matrix in matrices),
-        )
+        Block(copies[key], tuple(matrix[np.ix_(indices, indices)].astype(np.float64) for matrix in matrices))
         for key, indices in first.items()
     ]
 

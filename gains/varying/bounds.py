@@ -49,7 +49,7 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     if not rate >= 0.0:
         raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    largest = max(len(block.indices) for block in blocks)
+    largest = max(len(block.matrices[0]) for block in blocks)
     if largest > _LARGEST_BLOCK:
         raise BadModelError(
             f"the loop has a strongly connected block of {largest} states; at most {_LARGEST_BLOCK} are wanted"
