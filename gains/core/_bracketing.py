@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gains.core.arrays import BoolArray, FloatArray, IntArray
+from gains.core.arrays import BoolArray, FloatArray
 
 Functions = Callable[[FloatArray], FloatArray]
 
@@ -36,11 +36,6 @@ def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
         c, d = np.where(to_left, new, d), np.where(to_left, c, new)
         at_c, at_d = np.where(to_left, at_new, at_d), np.where(to_left, at_c, at_new)
     return (a + b) / 2.0
-
-
-def local_maxima(values: FloatArray) -> IntArray:
-    """Places of the samples (k,) off the ends that no neighbour exceeds."""
-    return np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
 def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
@@ -78,9 +73,7 @@ def may_reach_zero(points: FloatArray, values: FloatArray) -> BoolArray:
     return (inner >= left) & (inner >= right) & (inner <= 0.0) & (inner + _REACH * rise >= 0.0)
 
 
-def bracketed_roots(
-    function: Callable[[FloatArray], FloatArray], a: FloatArray, b: FloatArray, fa: FloatArray, fb: FloatArray
-) -> FloatArray:
+def bracketed_roots(function: Functions, a: FloatArray, b: FloatArray, fa: FloatArray, fb: FloatArray) -> FloatArray:
     """Roots of many scalar functions at once, each within its bracket [a, b], to rounding.
 
     Chandrupatla's method: inverse quadratic interpolation where it is safe, bisection elsewhere. `function` takes all

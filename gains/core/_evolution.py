@@ -13,6 +13,9 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 
+# standard deviation of the draws along their longest axis below which the search ends
+_RESOLUTION = 1e-7
+
 Rank = tuple[float, float]
 """What a point is worth, less being better: how far it is from what must hold (0 if it holds), then its cost."""
 
@@ -25,19 +28,10 @@ class Found:
     rank: Rank
 
 
-def best_of(
-    rank: Callable[[FloatArray], Rank],
-    start: FloatArray,
-    *,
-    step: float,
-    evaluations: int,
-    resolution: float = 1e-7,
-    enough: Callable[[Rank], bool] = lambda _: False,
-) -> Found:
+def best_of(rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: float, evaluations: int) -> Found:
     """Return the best point found from `start` (n,) with about as many evaluations, and fewer once steps are small.
 
-    `step` is the standard deviation of the first draws along every axis; the search ends below `resolution`, or at a
-    point that is `enough`.
+    `step` is the standard deviation of the first draws along every axis.
 
     >>> found = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
     >>> (found.point**2).round(3).tolist()
@@ -63,7 +57,7 @@ def best_of(
     for turn in range(max(1, evaluations // population)):
         values, axes = np.linalg.eigh((covariance + covariance.T) / 2)
         lengths = np.sqrt(values.clip(min=1e-20))
-        if sigma * float(lengths.max()) < resolution or enough(best.rank):
+        if sigma * float(lengths.max()) < _RESOLUTION:
             break
         draws = rng.standard_normal((population, n)) * lengths @ axes.T
         points = mean + sigma * draws

@@ -3,6 +3,7 @@
 `gains.design.design` turns a requirement into gains.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
 from typing import Any, Literal
@@ -75,17 +76,12 @@ class Criteria:
     """Weights of spacing errors and of velocity errors, the diagonal of W: every α then bounds |w| ≤ α |W E|."""
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            wanted = getattr(self, name)
-            if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
-                raise BadModelError(f"{name} = {wanted}; wanted a positive number")
+        _check_positive(self, _POSITIVE)
         if self.damping_min is not None and self.damping_min > 1.0:
             raise BadModelError(f"damping_min = {self.damping_min}; wanted at most 1")
-        for name in AT_DELAY:
-            if self.at_delay_s is None and (getattr(self, name) is not None or self.maximise == name):
+        for name in (*AT_DELAY, "discrete"):
+            if self.at_delay_s is None and (getattr(self, name) or self.maximise == name):
                 raise BadModelError(f"{name} is asked for without a delay; wanted at_delay_s")
-        if self.discrete and self.at_delay_s is None:
-            raise BadModelError("discrete is asked for without a delay; wanted at_delay_s")
         low, high = self.delays_s or (0.0, 0.0)
         if not 0.0 <= low <= high < inf:
             raise BadModelError(f"delays_s = {self.delays_s}; wanted two numbers of seconds, the smaller one first")
@@ -104,6 +100,14 @@ AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
 _POSITIVE = (
     "at_delay_s", *AT_DELAY, "damping_min", "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max",
 )  # fmt: skip
+
+
+def _check_positive(record: object, names: Iterable[str]) -> None:
+    """Raise BadModelError unless each field is None or a positive number."""
+    for name in names:
+        wanted = getattr(record, name)
+        if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
+            raise BadModelError(f"{name} = {wanted}; wanted a positive number")
 
 
 @dataclass(frozen=True)
@@ -143,10 +147,7 @@ class Requirement:
     """What else must be reached. Gains are then searched by `gains.design.for_delay`."""
 
     def __post_init__(self) -> None:
-        for name in ("delay_margin_s", "alpha", "decay_rate_1_s"):
-            wanted = getattr(self, name)
-            if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
-                raise BadModelError(f"{name} = {wanted}; wanted a positive number")
+        _check_positive(self, ("delay_margin_s", "alpha", "decay_rate_1_s"))
         if self.delay_margin_s is not None and self.delay_margin_s > DELAY_MARGIN_MAX_S:
             raise BadModelError(f"delay_margin_s = {self.delay_margin_s}; wanted at most {DELAY_MARGIN_MAX_S} s")
         if self.alpha is not None and self.alpha < ALPHA_MIN:

@@ -24,10 +24,9 @@ from gains.core.errors import BadModelError
 class Block:
     """A diagonal block of the triangular form, which stands for all its equal `copies`.
 
-    `indices` are the states of the first copy; `matrices` are its blocks of the given matrices, in their order.
+    `matrices` are the blocks (n, n) of the given matrices, in their order.
     """
 
-    indices: IntArray
     copies: int
     matrices: tuple[FloatArray, ...]
 
@@ -35,15 +34,14 @@ class Block:
 def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
     """The arguments as finite real square matrices of one size; BadModelError names the one that is not."""
     checked: list[FloatArray] = []
-    size = None
     for name, value in matrices.items():
         matrix = real_matrix(name, value)
         if matrix.shape[0] != matrix.shape[1]:
             raise BadModelError(f"{name} has shape {matrix.shape}; a square matrix is wanted")
-        size = matrix.shape[0] if size is None else size
-        if matrix.shape[0] != size:
-            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, as the other matrices")
         checked.append(matrix)
+        size = len(checked[0])
+        if len(matrix) != size:
+            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, as the other matrices")
     return checked
 
 
@@ -66,6 +64,13 @@ def positive_seconds(name: str, value: float) -> float:
     """`value` if it is positive and finite, else BadModelError with the name."""
     if not (np.isfinite(value) and value > 0.0):
         raise BadModelError(f"{name} is {value}; a positive number of seconds is wanted")
+    return float(value)
+
+
+def seconds(name: str, value: float) -> float:
+    """`value` if it is finite and not negative, else BadModelError with the name."""
+    if not (np.isfinite(value) and value >= 0.0):
+        raise BadModelError(f"{name} is {value}; a number of seconds >= 0 is wanted")
     return float(value)
 
 
@@ -113,11 +118,7 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
         first.setdefault(key, indices)
         copies[key] = copies.get(key, 0) + 1
     return [
-        Block(
-            indices=indices,
-            copies=copies[key],
-            matrices=tuple(matrix[np.ix_(indices, indices)].astype(np.float64) for matrix in matrices),
-        )
+        Block(copies[key], tuple(matrix[np.ix_(indices, indices)].astype(np.float64) for matrix in matrices))
         for key, indices in first.items()
     ]
 

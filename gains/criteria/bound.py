@@ -20,8 +20,7 @@ import numpy as np
 from scipy import linalg
 
 from gains.core.arrays import FloatArray
-from gains.core.errors import BadModelError
-from gains.core.structure import real_matrix, square_matrices
+from gains.core.structure import real_matrix, seconds, square_matrices
 
 # ε of the price of commands as a share of the unit of the states: from here on four digits of α stay the same
 _PRICE = 1e-4
@@ -42,8 +41,7 @@ def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = 
     (0.9538, 1.0)
     """
     [state], entry = square_matrices(A=A), real_matrix("B", B)
-    if not (np.isfinite(delay_s) and delay_s >= 0.0):
-        raise BadModelError(f"delay_s is {delay_s}; a number of seconds >= 0 is wanted")
+    seconds("delay_s", delay_s)
     low, high = _LEAST_GAMMA, _LARGEST_GAMMA
     if not _is_reached(state, entry, high, delay_s, price):
         return 0.0

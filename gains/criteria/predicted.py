@@ -27,25 +27,23 @@ of the whole formation. For disturbances the loop is continuous, R = (s I - A)^{
 noise is that of the sampled loop.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, pi
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core._bracketing import highest
+from gains.core._bracketing import Functions, highest
 from gains.core._norms import spectral_norms
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.criteria.figures import LoopFigures
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.response import Response, formation_loop
-from gains.sampled._loop import HeldPlant, carry, held_entry, radius_of, rate_of
+from gains.sampled._loop import HeldPlant, held_entry, radius_of, rate_of
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
@@ -54,8 +52,6 @@ _FREQUENCIES, _LOWEST = 1600, 1e-3
 _SHORT = 4.0
 # of the integral of the noise over the unit circle, which converges like a power of the number
 _ANGLES = 4096
-
-Complex = NDArray[np.complex128]
 
 
 def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArray:
@@ -143,7 +139,8 @@ class PredictedFigures:
             timing = Timing(self.period_s, self.period_s)
             return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
         half_s = self.period_s / 2.0
-        least_s, most_s = _rough_window(self._loop, self.assumed_s + half_s, _FREQUENCIES // self.thinned)
+        plant = HeldPlant(*self._loop, self.period_s)
+        least_s, most_s = _rough_window(plant, self.assumed_s + half_s, _FREQUENCIES // self.thinned)
         return max(0.0, least_s - half_s), most_s - half_s
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
@@ -213,14 +210,14 @@ class PredictedFigures:
         front, own = (self._loop[2][1] @ self._seen(z, delay_s)).T
         return np.abs((self.feed_forward + front) / (1.0 - own))
 
-    def _seen(self, z: Complex, delay_s: float) -> Complex:
+    def _seen(self, z: ComplexArray, delay_s: float) -> ComplexArray:
         """S."""
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
         R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
         mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
         return R @ G + self._ahead @ R @ mismatch
 
-    def _largest(self, function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> float:
+    def _largest(self, function: Functions, omega: FloatArray) -> float:
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
@@ -230,21 +227,18 @@ class PredictedFigures:
         (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
         K = self._fed_forward
 
-        def gain_at(delay_s: float) -> Callable[[FloatArray], FloatArray]:
-            def gain(omega: FloatArray) -> FloatArray:
-                s = 1j * omega[:, np.newaxis, np.newaxis]
-                R = np.linalg.inv(s * np.eye(len(A)) - A)
-                late = np.exp(-s * (delay_s + half_s))
-                seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
-                commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
-                moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
-                return spectral_norms(out @ moved)
-
-            return gain
+        def gain(omega: FloatArray, delay_s: float) -> FloatArray:
+            s = 1j * omega[:, np.newaxis, np.newaxis]
+            R = np.linalg.inv(s * np.eye(len(A)) - A)
+            late = np.exp(-s * (delay_s + half_s))
+            seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
+            commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
+            moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
+            return spectral_norms(out @ moved)
 
         most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
         omega = np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES)[:: self.thinned]
-        return max(self._largest(gain_at(delay_s), omega) for delay_s in self.delays_s)
+        return max(self._largest(lambda at, s=s: gain(at, s), omega) for s in self.delays_s)
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
@@ -283,15 +277,13 @@ class PredictedFigures:
         return float(np.abs(np.linalg.eigvals(A + B @ K)).min())
 
 
-def _rough_window(
-    loop: tuple[FloatArray, FloatArray, FloatArray], assumed_s: float, frequencies: int
-) -> tuple[float, float]:
+def _rough_window(plant: HeldPlant, assumed_s: float, frequencies: int) -> tuple[float, float]:
     """The window of the continuous loop, from crossings between frequencies on a grid.
 
     It is at its edge where e^{-s tau} = e^{-s tau^} + 1 / m, m an eigenvalue of K L (s I - A - B K)^{-1} B.
     """
-    A, B, K = loop
-    closed, onto = A + B @ K, K @ carry(A, None, np.array([assumed_s]))[0]
+    A, B, K = plant.A, plant.B, plant.K
+    closed, onto = A + B @ K, K @ plant.carry(np.array([assumed_s]))[0]
     highest = 4.0 * float(np.linalg.norm(onto @ B, 2)) + 2.0 * float(np.abs(np.linalg.eigvals(closed)).max())
     omega = highest * np.geomspace(1e-3, 1.0, frequencies)
     s = 1j * omega

@@ -64,7 +64,7 @@ _NEAR_AXIS = 0.1
 
 def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ...; BadModelError if too large."""
-    longest, states = len(block.matrices) - 1, len(block.indices)
+    longest, states = len(block.matrices) - 1, len(block.matrices[0])
     if longest > 1 and longest * states > _LARGEST_PRODUCT:
         raise BadModelError(
             f"the longest delay is {longest} times their common divisor, with {states} states; "

@@ -6,7 +6,7 @@ d_i} and refines extrema near one. The argument principle counts the roots that 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi
 
@@ -15,19 +15,11 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
-from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay
 from gains.delay._commensurate import column_space, companion_loci
 from gains.delay._crossings import Crossing, DelayedTerm
 from gains.delay._loci import swept_crossings
-from gains.delay._windows import (
-    BlockAnalysis,
-    DelayAnalysis,
-    block_analysis,
-    check_horizon,
-    combined_analysis,
-    without_zero,
-    zero_passage,
-)
+from gains.delay._windows import BlockAnalysis, block_analysis, without_zero, zero_passage
 
 # a loop without delay whose skew part is below this share of its norm is symmetric
 _SYMMETRIC = 1e-12
@@ -51,27 +43,16 @@ _SLOPE_STEP = 1e-3
 _LEAST_FREQUENCY = 1e-7
 
 
-def analyse_mixed(
-    terms: Sequence[DelayedTerm], *, horizon_s: float | None = None, leave_out_zero: bool = False
-) -> DelayAnalysis:
-    """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
-
-    `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. The crossing frequencies come
-    from a sweep: a search, not a proof. Options as of `gains.delay.constant.analyse_delay`. Raises BadModelError if
-    terms do not fit, a delay is negative or not finite, or the known delays are so long that the sweep would be too
-    large; DisagreementError if a root is too close to the imaginary axis at tau = 0 to count it.
-    """
-    matrices = _checked(terms)
-    check_horizon(horizon_s)
-    blocks = distinct_blocks(*matrices)
-    return combined_analysis([analyse_mixed_block(block, terms, leave_out_zero) for block in blocks], horizon_s)
-
-
 def analyse_mixed_block(block: Block, terms: Sequence[DelayedTerm], leave_out_zero: bool) -> BlockAnalysis:
-    """One block of x'(t) = sum A x(t - known_s - multiple tau), with the delays of `terms`. Exceptions as above."""
+    """One block of x'(t) = sum A x(t - known_s - multiple tau), with the delays of `terms`.
+
+    `unstable` counts the roots at tau = 0, with the known delays. The crossing frequencies come from a sweep: a search,
+    not a proof. Raises BadModelError if the known delays are so long that the sweep would be too large, and
+    DisagreementError if a root is too close to the imaginary axis at tau = 0 to count it.
+    """
     known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
     parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
-    delayed = [DelayedTerm(*part) for part in zip(parts.matrices, known_s.tolist(), multiples.tolist(), strict=True)]
+    delayed = [replace(term, matrix=matrix) for term, matrix in zip(terms, parts.matrices, strict=True)]
     passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
     if passage is None and is_singular_for_any_delay(parts.matrices):
         return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
@@ -88,13 +69,11 @@ def count_unstable_roots(
     `terms` are pairs (A, d): a real matrix (n, n) in 1/s and its delay in s. With `leave_out_zero` the simple root at
     s = 0 of a block whose matrices have a singular sum is not counted. `beside` are frequencies (rad/s) at which roots
     are known to be near the imaginary axis: two of them at one place turn the phase by a whole turn between two points,
-    which looks like none. Exceptions as of `analyse_mixed`.
+    which looks like none. Exceptions as of `analyse_mixed_block`.
     """
-    checked = [DelayedTerm(np.asarray(matrix, dtype=np.float64), delay_s, 0) for matrix, delay_s in terms]
-    blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
-    count = 0
-    for block in blocks:
-        parts = _Parts(np.array(balanced(*block.matrices)), delays_s, np.zeros(len(checked), dtype=np.intp))
+    delays_s, count = np.array([delay_s for _, delay_s in terms]), 0
+    for block in distinct_blocks(*(np.asarray(matrix, dtype=np.float64) for matrix, _ in terms)):
+        parts = _Parts(np.array(balanced(*block.matrices)), delays_s, np.zeros(len(terms), dtype=np.intp))
         at_zero = leave_out_zero and is_singular_for_any_delay(parts.matrices)
         count += block.copies * _unstable_roots(parts, at_zero, beside)
     return count
@@ -223,14 +202,3 @@ def _phase(parts: _Parts, hurwitz: ComplexArray, omega: FloatArray) -> FloatArra
         # of a matrix that is singular to rounding, and so on a root, the sign is 0: its neighbours tell
         signs.append(np.linalg.slogdet(matrix)[0])
     return np.angle(np.concatenate(signs)) - np.angle(1j * omega[:, np.newaxis] - hurwitz).sum(axis=1)
-
-
-def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
-    if len(terms) == 0:
-        raise BadModelError("terms is empty; at least one is wanted")
-    for i, term in enumerate(terms):
-        if not (np.isfinite(term.known_s) and term.known_s >= 0.0):
-            raise BadModelError(f"terms[{i}].known_s is {term.known_s}; a number of seconds >= 0 is wanted")
-        if term.multiple < 0:
-            raise BadModelError(f"terms[{i}].multiple is {term.multiple}; a whole number >= 0 is wanted")
-    return square_matrices(**{f"terms[{i}].matrix": term.matrix for i, term in enumerate(terms)})

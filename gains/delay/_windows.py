@@ -12,7 +12,7 @@ from math import gcd, inf, pi
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
-from gains.core.errors import BadModelError, DisagreementError
+from gains.core.errors import DisagreementError
 from gains.core.structure import is_singular_for_any_delay
 from gains.delay._crossings import Crossing, DelayedTerm, crossing_errors
 
@@ -136,12 +136,6 @@ def _windows(
         errors.update(zip(places, crossing_errors(block.terms, places), strict=True))
     blurred = [errors[crossing.omega_rad_s, crossing.delay_s] for crossing in crossings]
     return stability_windows(crossings, unstable, horizon_s, errors=blurred)
-
-
-def check_horizon(horizon_s: float | None) -> None:
-    """Raise BadModelError unless the horizon is None or a positive number of seconds."""
-    if horizon_s is not None and not horizon_s > 0.0:
-        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
 
 
 def block_analysis(

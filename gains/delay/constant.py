@@ -10,10 +10,11 @@ problems and matrix pencil methods for stability of delay-differential equations
 
 from numpy.typing import ArrayLike
 
+from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, square_matrices
 from gains.delay._commensurate import analyse_block
 from gains.delay._crossings import Crossing
-from gains.delay._windows import DelayAnalysis, check_horizon, combined_analysis
+from gains.delay._windows import DelayAnalysis, combined_analysis
 
 __all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin"]
 
@@ -41,7 +42,8 @@ def analyse_delay(
     [(0.1002, 1.7179)]
     """
     blocks = distinct_blocks(*square_matrices(**{f"A{k}": matrix for k, matrix in enumerate((A0, A1, *further))}))
-    check_horizon(horizon_s)
+    if horizon_s is not None and not horizon_s > 0.0:
+        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
     return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 

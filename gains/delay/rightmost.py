@@ -74,12 +74,10 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
     # the rightmost approximation need not belong to the rightmost root: all within its error band are refined
     band = 0.05 * (abs(upper[0]) + 1.0 / delays.max())
     near = int(np.count_nonzero(upper.real > upper[0].real - band))
-    if count > 1:
-        # approximations farther left may be of no root at all, or several of one
-        return _apart(
-            matrices, delays, [_upper(_newton(matrices, delays, s)) for s in upper[: 2 * count + 12].tolist()]
-        )
-    return [_upper(_newton(matrices, delays, root)) for root in upper[: min(near, 12)].tolist()]
+    tried = upper[: min(near, 12) if count == 1 else 2 * count + 12].tolist()
+    found = [_newton(matrices, delays, root) for root in tried]
+    # approximations farther left may be of no root at all, or several of one
+    return found if count == 1 else _apart(matrices, delays, found)
 
 
 def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -> list[complex]:
@@ -144,6 +142,7 @@ def _lagrange_row(nodes: FloatArray, at: float) -> FloatArray:
 def _newton(matrices: FloatArray, delays: FloatArray, root: complex) -> complex:
     """Newton steps on u*M(s)v = 0 with the singular vectors of the least singular value of M(s); the best iterate.
 
+    Of a complex pair it is the root with positive imaginary part.
     An iteration that runs away from its start (a multiple root, or a spurious approximation) ends there.
     """
     identity = np.eye(matrices.shape[1])
@@ -160,8 +159,4 @@ def _newton(matrices: FloatArray, delays: FloatArray, root: complex) -> complex:
         s -= step
         if abs(step) <= 4e-16 * abs(s) or abs(s - root) > 0.1 * (abs(root) + 1.0 / float(delays.max())):
             break
-    return best
-
-
-def _upper(root: complex) -> complex:
-    return complex(root.real, abs(root.imag))
+    return complex(best.real, abs(best.imag))

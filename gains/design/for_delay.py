@@ -196,18 +196,10 @@ class TreeGains:
         return ScalarGains(k1, share * k1, exp(last) * k1**2, 0.0)
 
     def figures(self, point: FloatArray) -> LoopFigures:
-        gains = self.gains(point)
-        return LoopFigures(
-            PAIR,
-            gains.K,
-            self.timing,
-            self.delay_s,
-            self.weight,
-            None if self.response is None else (self.response, self.response),
-            FlownLoop(gains, self.timing, self.response),
-            self.discrete,
-            _THINNED,
-        )
+        chain = FlownLoop(self.gains(point), self.timing, self.response)
+        K, responses = chain.pair.K, chain.pair.responses
+        weight, discrete = self.weight, self.discrete
+        return LoopFigures(PAIR, K, self.timing, self.delay_s, weight, responses, chain, discrete, _THINNED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,8 +234,8 @@ class PatternGains:
             for spare in _SPARES
         )
         tree = TreeGains(self.delay_s, self.timing)
-        alike = (tree.gains(point) for point in tree.starts)  # for every vehicle, those behind another
-        own = [self.model.overlapping_gain([[-g.k1]], [[g.k2]], [[g.k3]]) for g in alike]
+        # for every vehicle, those behind another
+        own = [tree.gains(point).gain_of(self.model) for point in tree.starts]
         return [self.point(K) for K in (*scaled, *own)]
 
     def point(self, K: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ fastest decay, with prediction over the delay and without. All are asked for sta
 share of the delay to either side, so that neither way counts on a delay that is known exactly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
@@ -94,18 +94,18 @@ class FrontSearch:
     def point(self, at: tuple[Route, float]) -> FrontPoint | Refusal:
         """The point of a route at a loop delay (s)."""
         route, delay_s = at
-        family = self._family(route, delay_s)
+        family, gain = self._family(route, delay_s)
         evaluations = _EVALUATIONS[route.method] if self.response is None else _EVALUATIONS_RESPONSE
         try:
             point, found = searched(family, self.wanted(route, delay_s), evaluations=evaluations)
         except GainsError as error:
             return Refusal(route, delay_s, str(error))
-        return self._point(route, delay_s, family, point, found)
+        return self._point(route, delay_s, gain(point), found)
 
     @cached_property
     def _graph(self) -> PatternGains:
         """Gains on the pattern, with the LQR gains from which searches start."""
-        return lqr_bases(self.formation, self.pattern)[1]
+        return lqr_bases(self.formation, self.pattern)
 
     def wanted(self, route: Route, delay_s: float) -> Requirement:
         """What is asked of the gains at a delay."""
@@ -113,19 +113,30 @@ class FrontSearch:
         criteria = Criteria(delay_s, route.aim, delays_s=around_s, delay_rate=0.0)
         return Requirement(criteria=criteria, string_peak_max=self.string_peak_max)
 
-    def _family(self, route: Route, delay_s: float) -> GainFamily:
+    @cached_property
+    def _single(self) -> FormationModel:
+        """The formation of one axis."""
+        return FormationModel(self.formation.predecessors, axes=1)
+
+    def _family(self, route: Route, delay_s: float) -> tuple[GainFamily, Callable[[FloatArray], FloatArray]]:
+        """The gains that a route chooses from, and from a point of them to K of the whole formation."""
         timing = FlownTiming(inf, self.period_s)
         if route.method == "graph-lqr":
             gains = replace(self._graph, delay_s=delay_s, timing=timing)
-            return PredictedPattern(gains) if route.predicted else gains
-        if route.predicted:
-            return PredictedTree(delay_s, self.period_s, tolerated=self.tolerated, response=self.response)
-        return TreeGains(delay_s, timing, response=self.response)
+            return PredictedPattern(gains) if route.predicted else gains, gains.gain
+        tree = TreeGains(delay_s, timing, response=self.response)
+        predicted = PredictedTree(delay_s, self.period_s, tolerated=self.tolerated, response=self.response)
+        return predicted if route.predicted else tree, lambda point: tree.gains(point).gain_of(self._single)
 
-    def _point(self, route: Route, delay_s: float, family: GainFamily, point: FloatArray, found: Figures) -> FrontPoint:
-        single = FormationModel(self.formation.predecessors, axes=1)
-        K = _gain(family, point, single)
-        whole = self.figures(single, K, delay_s, predicted=route.predicted)
+    def _point(self, route: Route, delay_s: float, K: FloatArray, found: Figures) -> FrontPoint:
+        single, response = self._single, self.response
+        if route.predicted:
+            whole = PredictedFigures(single, K, self.period_s, delay_s, (delay_s,), response=response)
+            stable_s = whole.window_s
+        else:
+            every = None if response is None else (response,) * single.vehicles
+            whole = LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s, responses=every)
+            stable_s = 0.0, whole.delay_margin_s
         return FrontPoint(
             route=route,
             delay_s=delay_s,
@@ -136,28 +147,8 @@ class FrontSearch:
             string_peak=found.string_peak if route.method == "inclusion" else None,
             spacing_gain_s2=whole.spacing_gain_max_s2,
             noise_gain=whole.noise_gain_max,
-            stable_s=whole.window_s if isinstance(whole, PredictedFigures) else (0.0, whole.delay_margin_s),
+            stable_s=stable_s,
         )
-
-    def figures(
-        self, single: FormationModel, K: FloatArray, delay_s: float, *, predicted: bool
-    ) -> LoopFigures | PredictedFigures:
-        """All figures of gains at a delay."""
-        if predicted:
-            return PredictedFigures(single, K, self.period_s, delay_s, (delay_s,), response=self.response)
-        every = None if self.response is None else (self.response,) * single.vehicles
-        return LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s, responses=every)
-
-
-def _gain(family: GainFamily, point: FloatArray, single: FormationModel) -> FloatArray:
-    """K of a point, of the whole formation."""
-    if isinstance(family, PredictedPattern):
-        return family.pattern.gain(point)
-    if isinstance(family, PatternGains):
-        return family.gain(point)
-    assert isinstance(family, TreeGains | PredictedTree)
-    found = (family if isinstance(family, TreeGains) else family.tree).gains(point)
-    return single.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
 
 
 def efficient(points: Sequence[FrontPoint]) -> list[FrontPoint]:

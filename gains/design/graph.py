@@ -112,7 +112,10 @@ def graph_design(
             "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop wants"
         )
     if wanted.criteria is not None:
-        gain = _searched(single, narrow, bases, wanted, period_s)
+        asked, starts = wanted.criteria, tuple(base.K for base in bases)
+        timing = FlownTiming(inf, period_s)
+        family = PatternGains(single, narrow.mask, starts, asked.at_delay_s, timing, asked.weight, asked.discrete)
+        gain = family.gain(searched(family, replace(wanted, string_peak_max=None))[0])
         return assess(formation, narrow, gain, period_s=period_s, requirement=wanted, method=method)
     base, gain = scaled_to(wanted, margins, bases)
     return assess(
@@ -121,27 +124,14 @@ def graph_design(
     )  # fmt: skip
 
 
-def _searched(
-    single: FormationModel, narrow: Pattern, bases: list[BaseGain], wanted: Requirement, period_s: float
-) -> FloatArray:
-    """The gain that meets a requirement with criteria, searched from base gains."""
-    criteria = wanted.criteria
-    assert criteria is not None
-    timing = FlownTiming(inf, period_s)
-    starts = tuple(base.K for base in bases)
-    family = PatternGains(single, narrow.mask, starts, criteria.at_delay_s, timing, criteria.weight, criteria.discrete)
-    point, _ = searched(family, replace(wanted, string_peak_max=None))
-    return family.gain(point)
+def lqr_bases(formation: FormationModel, pattern: Pattern) -> PatternGains:
+    """Return the gains on a pattern, for one axis, that begin with those of the structured LQR.
 
-
-def lqr_bases(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, PatternGains]:
-    """Return the formation of one axis, and the gains on its pattern that begin with those of the structured LQR.
-
-    The gains have no delay and no period yet. Raises as `graph_design` does.
+    They have no delay and no period yet. Raises as `graph_design` does.
     """
     single, narrow, plant = _narrowed(formation, pattern)
     bases = tuple(K for K, _, _ in _base_gains(plant, narrow, single, "graph-lqr"))
-    return single, PatternGains(single, narrow.mask, bases, None, FlownTiming(inf, 0.0))
+    return PatternGains(single, narrow.mask, bases, None, FlownTiming(inf, 0.0))
 
 
 def _narrowed(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, Pattern, Plant]:

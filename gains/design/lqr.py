@@ -59,7 +59,8 @@ class LyapunovEquations:
     """Both Lyapunov equations of one closed loop, from one Schur form that follows the loop's block triangular form.
 
     Eigenvalues are computed by strongly connected blocks: as a whole, a chain of identical followers is one defective
-    eigenvalue, which rounding would spread into the right half plane.
+    eigenvalue, which rounding would spread into the right half plane. `abscissa` is the
+    largest real part of one, 1/s.
     """
 
     def __init__(self, A: FloatArray, blocks: list[IntArray]) -> None:
@@ -67,7 +68,7 @@ class LyapunovEquations:
         order = np.concatenate(blocks[::-1])
         self._basis = np.zeros(A.shape)
         triangular = A[np.ix_(order, order)]
-        self._abscissa = -np.inf
+        self.abscissa = -np.inf
         start = 0
         for block in blocks[::-1]:
             place = slice(start, start + block.size)
@@ -78,14 +79,9 @@ class LyapunovEquations:
             triangular[place] = vectors.T @ triangular[place]
             triangular[place, place] = diagonal
             # LAPACK's standard form has equal diagonal entries, the real parts, in every 2×2 block
-            self._abscissa = max(self._abscissa, float(diagonal.diagonal().max()))
+            self.abscissa = max(self.abscissa, float(diagonal.diagonal().max()))
             start = place.stop
         self._triangular = triangular
-
-    @property
-    def abscissa(self) -> float:
-        """Largest real part of an eigenvalue of A, 1/s."""
-        return self._abscissa
 
     def observed(self, Q: FloatArray) -> FloatArray:
         """P with A'P + P A + Q = 0."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
-from gains.core.requirement import Requirement
+from gains.core.requirement import Criteria, Requirement
 from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import PatternGains, TreeGains, searched
 from gains.design.time_scale import time_scaled
@@ -91,16 +91,15 @@ def predicted_gains(
     criteria = wanted.criteria
     assert criteria is not None
     assert criteria.at_delay_s is not None
-    family = PredictedTree(criteria.at_delay_s, period_s, at_s, criteria.weight, _tolerated(wanted), response)
+    family = PredictedTree(criteria.at_delay_s, period_s, at_s, criteria.weight, _tolerated(criteria), response)
     evaluations = _EVALUATIONS if response is None else _EVALUATIONS_RESPONSE
     point, figures = searched(family, wanted, evaluations=evaluations)
     return replace(family.tree.gains(point), alpha=figures.alpha_at_delay)
 
 
-def _tolerated(wanted: Requirement) -> float:
+def _tolerated(criteria: Criteria) -> float:
     """Half the width of the wanted window as a share of the assumed delay."""
-    criteria = wanted.criteria
-    if criteria is None or criteria.delays_s is None or criteria.at_delay_s is None:
+    if criteria.delays_s is None or criteria.at_delay_s is None:
         return _TOLERATED
     return max(1e-3, (criteria.delays_s[1] - criteria.delays_s[0]) / 2.0 / criteria.at_delay_s)
 

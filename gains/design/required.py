@@ -9,7 +9,7 @@ from dataclasses import replace
 from gains.core._bracketing import met_end
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import DELAY_MARGIN_MAX_S, ChainLimit, Requirement
-from gains.criteria.parts import rounded
+from gains.criteria.parts import parts_of, rounded
 from gains.design.search import fastest_decay, largest_alpha, largest_margin
 from gains.performance.lone_margin import lone_margin
 from gains.performance.response import Response, sampled_margin
@@ -65,17 +65,13 @@ def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: ChainLimit) 
 
 def _conflict(wanted: Requirement, period_s: float) -> str:
     """What cannot be had, and how far each part alone would have to be relaxed."""
-    given = {
-        name: value
-        for name in ("delay_margin_s", "alpha", "decay_rate_1_s")
-        if (value := getattr(wanted, name)) is not None
-    }
-    reached = {name: rounded(most, up=False) for name in given if (most := _most(name, wanted, period_s)) > 0.0}
-    lower = [f"lower {name} to {most:g}" for name, most in reached.items()]
+    given = [part for part in parts_of(wanted) if part.at_least]
+    reached = [(part.name, rounded(_most(part.name, wanted, period_s), up=False)) for part in given]
+    lower = [f"lower {name} to {most:g}" for name, most in reached if most > 0.0]
     unlimited = replace(wanted, string_peak_max=None)
     if wanted.string_peak_max is not None and _best_gains(unlimited, period_s) is not None:
         lower.append(f"raise string_peak_max = {wanted.string_peak_max:g}")
-    named = " and ".join(f"{name} = {value:g}" for name, value in given.items())
+    named = " and ".join(f"{part.name} = {part.wanted_text}" for part in given)
     conflict = "exclude each other" if len(given) > 1 else "cannot be reached"
     advice = " or ".join(lower) if lower else "lower more than one of them" if len(given) > 1 else "lower period_s"
     return f"{named} {conflict} with period_s = {period_s:g}: {advice}"

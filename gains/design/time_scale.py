@@ -99,14 +99,14 @@ def _at_margin(wanted: Requirement, margins: BoundedMargins, bases: Sequence[Bas
     # exact but for terms in the square of the period
     scaled = [(base, (margin_s + period_s / 2.0) / base.margin_s) for base in bases]
     reached = [_figures(margins, *each) for each in scaled]
-    if not any(_meets(figures, wanted) for figures in reached):
+    meeting = [k for k, figures in enumerate(reached) if _meets(figures, wanted)]
+    if not meeting:
         asked, most = _short_of(wanted, reached)
         raise InfeasibleError(
             f"with delay_margin_s = {margin_s} this pattern does not reach {asked}: {most} at most; lower that, or "
             "delay_margin_s"
         )
-    best = max((k for k, figures in enumerate(reached) if _meets(figures, wanted)), key=lambda k: reached[k][0])
-    base, scale = scaled[best]
+    base, scale = scaled[max(meeting, key=lambda k: reached[k][0])]
     for _ in range(_SCALING_STEPS):
         found_s = margins.sampled_s(time_scaled(margins.model, base.K, scale))
         if margin_s <= found_s <= margin_s * (1.0 + _SPARE):

@@ -58,7 +58,6 @@ class ExpandedGain:
     """The maps of K = φ1 K̄ φ2 for a partition."""
 
     pattern: Pattern
-    partition: Partition
     phi1: FloatArray
     phi2: FloatArray
     """0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs)."""
@@ -138,7 +137,7 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     phi2 = _stacked([j for graph in graphs for j in graph.outputs], pattern.output_sizes)
     rows = [k for k, graph in enumerate(graphs) for i in graph.inputs for _ in range(pattern.input_sizes[i])]
     columns = [k for k, graph in enumerate(graphs) for j in graph.outputs for _ in range(pattern.output_sizes[j])]
-    return ExpandedGain(pattern, partition, phi1, phi2, np.equal.outer(rows, columns))
+    return ExpandedGain(pattern, phi1, phi2, np.equal.outer(rows, columns))
 
 
 def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> float:

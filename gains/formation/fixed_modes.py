@@ -43,8 +43,6 @@ class FixedMode:
     """λ, 1/s; of a complex pair the one with positive imaginary part."""
     states: tuple[int, ...]
     """Indices of the states of the components in which λ is fixed."""
-    cut: tuple[int, ...]
-    """The inputs (vehicles) D of (1) in those components; all others there are E."""
     remedies: tuple[tuple[Link, ...], ...]
     """Sets of links each of which, added to the pattern, frees the mode; empty if λ is not controllable or not
     observable even with all inputs and outputs."""
@@ -63,7 +61,6 @@ class _Component:
     A: FloatArray
     B: tuple[FloatArray, ...]
     C: FloatArray
-    inputs: tuple[int, ...]
     rows: tuple[BoolArray, ...]
 
 
@@ -87,15 +84,13 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     check_fits(plant, pattern)
     gains = _random_gains(plant, pattern, seed)
     feedbacks = [plant.B @ gain @ plant.C for gain in gains]
-    found: dict[complex, tuple[set[int], set[int]]] = {}
+    found: dict[complex, set[int]] = {}
     for component in _components(plant, pattern):
-        for mode, cut in _fixed_in(component, feedbacks):
-            states, inputs = found.setdefault(mode, (set(), set()))
-            states.update(component.states.tolist())
-            inputs.update(component.inputs[k] for k in cut)
+        for mode in _fixed_in(component, feedbacks):
+            found.setdefault(mode, set()).update(component.states.tolist())
     return tuple(
-        FixedMode(mode, tuple(sorted(states)), tuple(sorted(cut)), _remedies(plant, pattern, mode, gains[0]))
-        for mode, (states, cut) in sorted(found.items(), key=lambda item: (item[0].real, item[0].imag))
+        FixedMode(mode, tuple(sorted(states)), _remedies(plant, pattern, mode, gains[0]))
+        for mode, states in sorted(found.items(), key=lambda item: (item[0].real, item[0].imag))
     )
 
 
@@ -122,20 +117,19 @@ def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
     for states in strongly_connected_blocks(plant.A, feedback):
         B = [plant.B[states, pattern.input_slice(i)] for i in range(len(pattern.input_sizes))]
         C = plant.C[:, states]
-        inputs = tuple(i for i, block in enumerate(B) if block.any())
+        inputs = [i for i, block in enumerate(B) if block.any()]
         rows = tuple(np.repeat(pattern.blocks[i], pattern.output_sizes) & C.any(axis=1) for i in inputs)
-        A = plant.A[np.ix_(states, states)]
-        found.append(_Component(states, A, tuple(B[i] for i in inputs), C, inputs, rows))
+        found.append(_Component(states, plant.A[np.ix_(states, states)], tuple(B[i] for i in inputs), C, rows))
     return found
 
 
-def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[tuple[complex, frozenset[int]]]:
-    """The fixed modes of one component, each with D as positions among the component's inputs."""
+def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[complex]:
+    """The fixed modes of one component."""
     at = np.ix_(component.states, component.states)
-    fixed: list[tuple[complex, frozenset[int]]] = []
+    fixed: list[complex] = []
     for mode in _candidates(component.A):
         stays = all(_is_eigenvalue(component.A + feedback[at], mode) for feedback in feedbacks)
-        rank, cut = _least_rank(component, mode)
+        rank = _least_rank(component, mode)
         if stays != (rank < component.states.size):
             raise DisagreementError(
                 f"mode {_number(mode)} of the states {component.states.tolist()}: by rank ({rank} of "
@@ -143,12 +137,12 @@ def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[tuple[
                 f"{'do not ' if stays else ''}move it; scale the plant so that its entries are of like size"
             )
         if stays:
-            fixed.append((mode, cut))
+            fixed.append(mode)
     return fixed
 
 
-def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[int]]:
-    """Least rank of (1) over all D, and the D."""
+def _least_rank(component: _Component, mode: complex) -> int:
+    """Least rank of (1) over all D."""
     n = component.states.size
     shifted = component.A - mode * np.eye(n)
     left, singular, right = np.linalg.svd(shifted)
@@ -170,11 +164,10 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
         above = np.hstack([np.zeros((n - kept, n - kept)), *(moved[k] for k in acting)])
         return kept + _rank(np.vstack([above, below]), _size(shifted))
 
-    size = len(component.inputs)
+    size = len(component.B)
     if size > LARGEST_EXHAUSTIVE:
         return _least_submodular(rank, size)
-    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
-    return min(((rank(subset), subset) for subset in subsets), key=lambda item: item[0])
+    return min(rank(frozenset(k for k in range(size) if code >> k & 1)) for code in range(2**size))
 
 
 def _candidates(A: FloatArray) -> list[complex]:
@@ -275,8 +268,8 @@ def _number(mode: complex) -> str:
     return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"
 
 
-def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of an integer submodular function of subsets of range(size), and a set with that value.
+def _least_submodular(value_of: SetFunction, size: int) -> int:
+    """The least value of an integer submodular function of subsets of range(size).
 
     A rank is submodular: a column raises the rank of a set by no more than that of any of its subsets. Wolfe's
     algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every x on the way proves the lower
@@ -286,8 +279,7 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
     """
     from scipy.optimize import nnls  # takes longer to import than small patterns to analyse
 
-    empty = value_of(frozenset())
-    best = (empty, frozenset[int]())
+    best = empty = value_of(frozenset())
 
     def vertex(x: FloatArray) -> FloatArray:
         """The vertex of the base polytope least in the direction x (Edmonds' greedy algorithm)."""
@@ -297,20 +289,20 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
             subset |= {k}
             next_value = value_of(subset)
             point[k], value = next_value - value, next_value
-            best = min(best, (value, subset), key=lambda item: item[0])
+            best = min(best, value)
         return point
 
     points = vertex(np.zeros(size))[np.newaxis]
     weights = np.ones(1)
     for _ in range(_ROUNDS):
         x = weights @ points
-        if empty + np.minimum(x, 0.0).sum() > best[0] - 1 + 1e-6:
+        if empty + np.minimum(x, 0.0).sum() > best - 1 + 1e-6:
             return best
         points = np.vstack([points, vertex(x)])
         # the point of least norm in the hull of the points, as a problem of nonnegative least squares
         weights = nnls(np.vstack([points.T, np.ones(len(points))]), np.append(np.zeros(size), 1.0))[0]
         points, weights = points[weights > 0.0], weights[weights > 0.0] / weights.sum()
     raise DisagreementError(
-        f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best[0]}; the ranks are "
+        f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best}; the ranks are "
         "decided by rounding: scale the plant so that its entries are of like size"
     )

@@ -41,10 +41,6 @@ class Expansion:
     A: Sparse
     B: Sparse
     """A~ and B~ of the expanded system."""
-    M: Sparse
-    N: Sparse
-    """Complementary matrices: A~ = V A U + M, B~ = V B Q + N. A restriction needs MV = 0 and NR = 0 for type (a), N = 0
-    for type (b)."""
     restriction: Restriction
     """"a": A~V = VA and B~R = VB. "b": A~V = VA and B~ = VBQ (Theorem 2)."""
 
@@ -69,14 +65,9 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
     V = _selection(state_source, formation.states, formation.axes)
     R = _selection(input_source, formation.inputs, formation.axes)
     U, Q = _mean_of_copies(V), _mean_of_copies(R)
-    A, B = csr_array(formation.A), csr_array(formation.B)
-    A_expanded = _disjoint(formation, lambda subsystem: subsystem.A)
-    mean_input = V @ B @ Q
-    B_expanded = _disjoint(formation, lambda subsystem: subsystem.B) if restriction == "a" else mean_input
-    return Expansion(
-        V=V, U=U, R=R, Q=Q, A=A_expanded, B=B_expanded,
-        M=A_expanded - V @ A @ U, N=B_expanded - mean_input, restriction=restriction,
-    )  # fmt: skip
+    A = _disjoint(formation, lambda subsystem: subsystem.A)
+    B = _disjoint(formation, lambda subsystem: subsystem.B) if restriction == "a" else V @ csr_array(formation.B) @ Q
+    return Expansion(V=V, U=U, R=R, Q=Q, A=A, B=B, restriction=restriction)
 
 
 def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> Sparse:

@@ -8,7 +8,7 @@ if there are known delays beside it, `gains.sampled.constant` for a held loop of
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from math import ceil, floor, gcd, inf, log10, pi
+from math import ceil, floor, gcd, inf, lcm, log10, pi
 
 import numpy as np
 
@@ -136,27 +136,23 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     unit = _common_divisor([term.multiple for term in model.terms])
-    steps = [int(term.multiple / unit) for term in model.terms]
-    if max(steps) > _MOST_STEPS:
+    # in the common divisor of the delays; the unknown is that divided by `unit`
+    read = [DelayedTerm(term.matrix, term.fixed_s, int(term.multiple / unit)) for term in model.terms]
+    most = max(term.multiple for term in read)
+    if most > _MOST_STEPS:
         raise BadModelError(
-            f"terms: read delays up to {max(steps)} times their common divisor {unit}*{model.unknown}, "
+            f"terms: read delays up to {most} times their common divisor {unit}*{model.unknown}, "
             f"wanted at most {_MOST_STEPS} times"
         )
-    # in the common divisor of the delays; the unknown is that divided by `unit`
-    parts = zip((term.matrix for term in model.terms), (term.fixed_s for term in model.terms), steps, strict=True)
-    terms, analysis, taken_out = _analysed([DelayedTerm(*part) for part in parts])
+    terms, analysis, taken_out = _analysed(read)
     checked_by, margin_error_s = second_opinions(analysis, terms)
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
-    if fixed:
-        notes = _fixed_note(fixed, "0 at every delay")
-    elif not analysis.stable_intervals_s and any(
-        is_singular_for_any_delay(balanced(*block.matrices))
-        for block in distinct_blocks(*(term.matrix for term in terms))
-    ):
-        notes = ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
-    else:
-        notes = ()
+    notes = _fixed_note(fixed, "0 at every delay")
+    if not fixed and not analysis.stable_intervals_s:
+        blocks = distinct_blocks(*(term.matrix for term in terms))
+        if any(is_singular_for_any_delay(balanced(*block.matrices)) for block in blocks):
+            notes = ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
     places = [(crossing.omega_rad_s, crossing.delay_s) for crossing in analysis.crossings[:_ERRORS_OF]]
     errors_s = [by_delay_s * scale for _, by_delay_s in crossing_errors(terms, places)]
     errors_s += [np.nan] * (len(analysis.crossings) - len(errors_s))
@@ -252,6 +248,10 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
 
     loop, fixed = _held_moving(model)
+
+    def map_at(delay_s: float) -> FloatArray:
+        return period_map(*loop, period_s=period_s, delay_s=delay_s)
+
     margin_s = sampled_delay_margin(*loop, period_s=period_s)
     crossings: tuple[MarginCrossing, ...] = ()
     checks: tuple[str, ...] = ()
@@ -265,14 +265,10 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
                 f"one-period map is {before} before it, {at} at it and {after} after it"
             )
         checks = ("spectral radius",)
-
-        def map_at(delay_s: float) -> FloatArray:
-            return period_map(*loop, period_s=period_s, delay_s=delay_s)
-
         eigenvalues = np.linalg.eigvals(map_at(margin_s))
         omega = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))]))) / period_s
         crossings = (MarginCrossing(omega, margin_s, 1, None, None, _map_error(map_at, margin_s)),)
-    at_once = np.linalg.eigvals(period_map(*loop, period_s=period_s, delay_s=0.0))
+    at_once = np.linalg.eigvals(map_at(0.0))
     beyond = "" if margin_s == inf else "; longer delays than its margin were not looked at"
     return LoopMargin(
         unknown="tau",
@@ -290,13 +286,13 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
 
 def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
     """Error (s) of the instant at which the spectral radius of a one-period map passes one, by rounding."""
-    size = len(map_at(at_s))
+    matrix = map_at(at_s)
+    size = len(matrix)
     if size > _LARGEST_MAP:
         return np.nan
     step_s = _BESIDE * at_s
-    radii = [float(np.abs(np.linalg.eigvals(map_at(at_s + way * step_s))).max()) for way in (-1.0, 1.0)]
-    slope = abs(radii[1] - radii[0]) / (2.0 * step_s)
-    matrix = map_at(at_s)
+    before, after = (float(np.abs(np.linalg.eigvals(map_at(at_s + way * step_s))).max()) for way in (-1.0, 1.0))
+    slope = abs(after - before) / (2.0 * step_s)
     eigenvalues, vectors = np.linalg.eig(matrix)
     epsilon = _BACKWARD * size * float(np.finfo(np.float64).eps) * float(np.linalg.norm(matrix))
     # left and right vectors of the largest eigenvalue: their angle is its condition
@@ -309,8 +305,5 @@ def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
 
 def _common_divisor(multiples: list[Fraction]) -> Fraction:
     """The largest fraction of which all multiples are whole multiples; 1 if all are zero."""
-    present = [multiple for multiple in multiples if multiple != 0]
-    if not present:
-        return Fraction(1)
-    denominator = np.lcm.reduce([multiple.denominator for multiple in present], dtype=object)
-    return Fraction(gcd(*(int(multiple * denominator) for multiple in present)), int(denominator))
+    denominator = lcm(*(multiple.denominator for multiple in multiples))
+    return Fraction(gcd(*(int(multiple * denominator) for multiple in multiples)), denominator) or Fraction(1)

@@ -87,7 +87,7 @@ def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thoroug
     if on_axis or any(term.known_s for term in terms):
         return None
     matrices = by_multiple(terms)
-    sizes = [len(block.indices) for block in distinct_blocks(*matrices)]
+    sizes = [len(block.matrices[0]) for block in distinct_blocks(*matrices)]
     if not thorough and sum(size**3 for size in sizes) > _SWEEP_BUDGET:
         return None
     return circle_sweep_margin(matrices)
@@ -118,7 +118,7 @@ def _confirmed_beside_windows(
 ) -> set[str]:
     """Compare the windows with the spectrum inside and beside them; the methods by which a delay could be checked."""
     rate = sum(float(np.linalg.norm(term.matrix)) for term in terms)
-    largest = max(len(block.indices) for block in distinct_blocks(*(term.matrix for term in terms)))
+    largest = max(len(block.matrices[0]) for block in distinct_blocks(*(term.matrix for term in terms)))
     methods: set[str] = set()
     for tau_s, stable in _delays_to_look_at(analysis, rate, error_s, thorough):
         pairs = [(term.matrix, term.delay_s(tau_s)) for term in terms]

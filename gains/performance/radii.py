@@ -17,13 +17,12 @@ The worst Δ comes with either radius. The complex one has rank one, and first-o
 (1 + c/z) give each of its entries the phase that it has at the worst frequency, so its size is the same at all others.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, pi, tau
 
 import numpy as np
 
-from gains.core._bracketing import highest, peaks
+from gains.core._bracketing import Functions, highest, peaks
 from gains.core._norms import spectral_norms
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
@@ -123,9 +122,7 @@ class SectorLoop:
         acts = np.eye(size)[:, list(self.errors)]
         return HeldPlant(formation.A, acts, acts.T, T).transition(np.array([T]))[1][0]
 
-    def _peak(
-        self, function: Callable[[FloatArray], FloatArray], more: FloatArray, values: FloatArray
-    ) -> tuple[float, float]:
+    def _peak(self, function: Functions, more: FloatArray, values: FloatArray) -> tuple[float, float]:
         """Frequency and height of the largest value, local maxima refined; `more` frequencies have known values."""
         T = self.formation.period_s
         grid = np.geomspace(_LEAST_ANGLE, pi * (1.0 - 1e-9), _ANGLES) / T

@@ -5,12 +5,12 @@ margin depends on (k1, k3) alone and the gains of a given margin form a curve wi
 (`gains_of_margin`).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 
 import numpy as np
 
+from gains.core._bracketing import Functions
 from gains.core.arrays import FloatArray, IntArray
 from gains.formation.model import FormationModel
 
@@ -35,7 +35,11 @@ class ScalarGains:
     @property
     def K(self) -> FloatArray:  # noqa: N802 - the source's letter
         """K of u = K e for `PAIR`, shape (2, 3)."""
-        return PAIR.overlapping_gain([[-self.k1]], [[self.k2]], [[self.k3]])
+        return self.gain_of(PAIR)
+
+    def gain_of(self, model: FormationModel) -> FloatArray:
+        """K of u = K e of a formation of one axis whose vehicles all have these gains, shape (inputs, states)."""
+        return model.overlapping_gain([[-self.k1]], [[self.k2]], [[self.k3]])
 
 
 def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
@@ -178,7 +182,7 @@ def _frequencies_below_growth(k1: FloatArray, k3: FloatArray, feed_forward: floa
     return np.broadcast_to(np.linspace(0, highest, count + 1)[1:], (*k1.shape, count))
 
 
-def _around_least(function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> tuple[FloatArray, IntArray]:
+def _around_least(function: Functions, omega: FloatArray) -> tuple[FloatArray, IntArray]:
     """The values around the least one of each row, ever closer, and its index along the last axis, off the ends."""
     values = function(omega)
     at = _index_of_least(values)

@@ -73,15 +73,10 @@ class HeldPlant:
 
         e^{A t} of the measured states; the others do not differ.
         """
-        return carry(self.A, self.measured, duration_s)
-
-
-def carry(A: FloatArray, measured: BoolArray | None, duration_s: FloatArray) -> FloatArray:
-    """See `HeldPlant.carry`."""
-    seen = np.arange(len(A)) if measured is None else np.flatnonzero(measured)
-    maps = np.zeros((duration_s.size, *A.shape))
-    maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(A[np.ix_(seen, seen)], duration_s)
-    return maps
+        seen = np.arange(len(self.A)) if self.measured is None else np.flatnonzero(self.measured)
+        maps = np.zeros((duration_s.size, *self.A.shape))
+        maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(self.A[np.ix_(seen, seen)], duration_s)
+        return maps
 
 
 def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatArray:

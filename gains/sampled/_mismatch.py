@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import local_maxima, may_reach_zero
+from gains.core._bracketing import may_reach_zero
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._loci import log_moduli, solved_beside_poles
@@ -179,7 +179,8 @@ class _Search:
         else:
             [(angle, values)] = self.loop.resolved(np.array([delay_s]))
             sizes = np.abs(values)
-            least = np.concatenate([[0], local_maxima(-sizes), [sizes.size - 1]])
+            dips = np.flatnonzero((sizes[1:-1] <= sizes[:-2]) & (sizes[1:-1] <= sizes[2:])) + 1
+            least = np.concatenate([[0], dips, [sizes.size - 1]])
             angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
         return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
 

@@ -129,9 +129,6 @@ def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCr
     def log_radius(periods_s: FloatArray) -> FloatArray:
         return np.log(np.maximum(np.abs(_eigenvalues(block, periods_s)).max(axis=1), 1e-300))
 
-    def minus_log_radius(periods_s: FloatArray) -> FloatArray:
-        return -log_radius(periods_s)
-
     def crossing(period_s: float, direction: int) -> PeriodCrossing:
         [eigenvalues] = _eigenvalues(block, np.array([period_s]))
         angle = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))])))
@@ -144,7 +141,7 @@ def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCr
         looked_at, start_s = looked_at + periods_s.size, float(periods_s[-1])
         periods_s, logs = _with_peaks(log_radius, periods_s, log_radius(periods_s))
         # dips into stability between two looks
-        periods_s, negative = _with_peaks(minus_log_radius, periods_s, -logs)
+        periods_s, negative = _with_peaks(lambda at_s: -log_radius(at_s), periods_s, -logs)
         touches_s, off = periods_s[negative == 0.0], negative != 0.0
         periods_s, logs = periods_s[off], -negative[off]
         at = np.flatnonzero(np.sign(logs[1:]) != np.sign(logs[:-1]))

@@ -11,12 +11,11 @@ the modified z-transform in state space. The loop is stable exactly if the spect
 below one. For small T the margin in tau is the continuous one less T / 2, up to terms in T^2.
 """
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import positive_seconds, real_matrix, square_matrices
+from gains.core.structure import positive_seconds, real_matrix, seconds, square_matrices
 from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map, rate_of
 
@@ -28,7 +27,7 @@ def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, del
     +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an argument that is not.
     """
     plant = HeldPlant(*checked_loop(A, B, K), positive_seconds("period_s", period_s))
-    return lifted_map(plant, checked_delay(delay_s))
+    return lifted_map(plant, seconds("delay_s", delay_s))
 
 
 def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
@@ -37,7 +36,7 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
     Strongly connected blocks are taken one by one, so that equal followers do not spoil each other's eigenvalues.
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=positive_seconds("period_s", period_s))
-    return max(block_radius(plant, checked_delay(delay_s)) for plant in plants)
+    return max(block_radius(plant, seconds("delay_s", delay_s)) for plant in plants)
 
 
 def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
@@ -80,10 +79,3 @@ def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, 
     if feedback.shape != entry.shape[::-1]:
         raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
     return plant, entry, feedback
-
-
-def checked_delay(delay_s: float) -> float:
-    """`delay_s`, or BadModelError."""
-    if not (np.isfinite(delay_s) and delay_s >= 0.0):
-        raise BadModelError(f"delay_s is {delay_s}; a number of seconds >= 0 is wanted")
-    return float(delay_s)

@@ -15,7 +15,7 @@ from gains.core.arrays import FloatArray
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
-from gains.sampled._loop import carry
+from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
 from gains.sampled.prediction import (
@@ -95,8 +95,9 @@ class PredictedLoop:
 
     def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
         assumed_s = self.assumed_s + self.timing.held_s / 2.0
-        mask = checked_mask((self.A, self.B, self.K), self.measured)
-        late = self.B @ (self.K @ carry(self.A, mask, np.array([assumed_s]))[0])
+        loop = self.A, self.B, self.K
+        plant = HeldPlant(*loop, self.timing.held_s, checked_mask(loop, self.measured))
+        late = self.B @ (self.K @ plant.carry(np.array([assumed_s]))[0])
         return [(self.A + self.B @ self.K, 0.0), (-late, assumed_s)], late
 
 

@@ -25,10 +25,10 @@ from numpy.typing import ArrayLike
 
 from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
-from gains.core.structure import positive_seconds
+from gains.core.structure import positive_seconds, seconds
 from gains.delay.constant import delay_margin
 from gains.sampled._loop import HeldPlant, SampledPlant, block_radius, held_blocks, radius_of, rate_of
-from gains.sampled.constant import checked_delay, checked_loop, sampled_delay_margin
+from gains.sampled.constant import checked_loop, sampled_delay_margin
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
@@ -235,7 +235,7 @@ def lifted_radius(plant: SampledPlant, timing: Timing, *, delay_s: float, predic
 def lifted_growth(plants: Sequence[SampledPlant], timing: Timing, *, delay_s: float) -> float:
     """`multirate_growth_rate` (1/s) at a mean loop delay (s), from the plants of the blocks in a common period."""
     if timing.commands == 1:
-        radius = max(block_radius(plant, checked_delay(delay_s)) for plant in plants)
+        radius = max(block_radius(plant, seconds("delay_s", delay_s)) for plant in plants)
     else:
         radius = max(lifted_radius(plant, timing, delay_s=delay_s) for plant in plants)
     return rate_of(radius, timing.common_s)

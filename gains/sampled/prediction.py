@@ -22,15 +22,16 @@ Z. Artstein, "Linear systems with delayed controls: a reduction", IEEE Trans. AC
 """
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import inf
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
+from gains.core.structure import seconds
 from gains.sampled._continuous_mismatch import continuous_crossings
-from gains.sampled._loop import HeldPlant, held_blocks, rate_of
+from gains.sampled._loop import held_blocks, rate_of
 from gains.sampled._mismatch import common_window
 from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
@@ -64,7 +65,7 @@ def mismatch_window(
     >>> [round(end_s, 3) for end_s in mismatch_window([[0]], [[1]], [[-1]], Timing(0.02, 0.02), assumed_s=3.0)]
     [1.449, 4.765]
     """
-    loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
+    loop, late_s = checked_loop(A, B, K), seconds("assumed_s", assumed_s)
     plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
     return common_window(plants, timing, late_s)
 
@@ -81,7 +82,7 @@ def mismatch_window_continuous(
     >>> [round(end_s, 3) for end_s in mismatch_window_continuous([[0]], [[1]], [[-1]], assumed_s=3.0)]
     [1.386, 4.873]
     """
-    loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
+    loop, late_s = checked_loop(A, B, K), seconds("assumed_s", assumed_s)
     plants = held_blocks(*loop, period_s=1.0, measured=checked_mask(loop, measured))
     if max(float(np.linalg.eigvals(plant.A + plant.B @ plant.K).real.max()) for plant in plants) >= 0.0:
         return late_s, late_s
@@ -109,17 +110,10 @@ def predicted_growth_rate(
     >>> round(predicted_growth_rate([[0]], [[1]], [[-1]], Timing(0.5, 0.5), assumed_s=3.2, delay_s=3.2), 6)
     -1.386294
     """
-    loop = checked_loop(A, B, K)
+    loop, late_s = checked_loop(A, B, K), seconds("assumed_s", assumed_s)
     plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
-    radius = max(_radius(plant, timing, checked_assumption(assumed_s), delay_s) for plant in plants)
-    return rate_of(radius, timing.common_s)
-
-
-def checked_assumption(assumed_s: float) -> float:
-    """The assumed delay, or BadModelError."""
-    if not (isfinite(assumed_s) and assumed_s >= 0.0):
-        raise BadModelError(f"assumed_s is {assumed_s}; a number of seconds >= 0 is wanted")
-    return float(assumed_s)
+    radii = [lifted_radius(own, timing, delay_s=delay_s, predictor=Predictor(own, late_s)) for own in plants]
+    return rate_of(max(radii), timing.common_s)
 
 
 def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None) -> BoolArray | None:
@@ -132,7 +126,3 @@ def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequ
         wanted = f"{len(A)} flags, with K and the states not measured independent as documented, are wanted"
         raise BadModelError(f"measured is {mask.tolist()}; {wanted}")
     return mask
-
-
-def _radius(plant: HeldPlant, timing: Timing, assumed_s: float, delay_s: float) -> float:
-    return lifted_radius(plant, timing, delay_s=delay_s, predictor=Predictor(plant, assumed_s))

@@ -49,7 +49,7 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     if not rate >= 0.0:
         raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    largest = max(len(block.indices) for block in blocks)
+    largest = max(len(block.matrices[0]) for block in blocks)
     if largest > _LARGEST_BLOCK:
         raise BadModelError(
             f"the loop has a strongly connected block of {largest} states; at most {_LARGEST_BLOCK} are wanted"
@@ -87,11 +87,7 @@ def _varying_bound_of_block(now: FloatArray, late: FloatArray, rate: float) -> f
     upper = min(margin_s, _LONGEST)
     if upper > 0.0 and _is_independent_of_length(now, late, rate):
         return inf
-
-    def proved(delay_s: float) -> bool:
-        return _varying_functional_exists(now, late, delay_s, rate)
-
-    bound_s = _bisected(proved, upper)
+    bound_s = _bisected(lambda delay_s: _varying_functional_exists(now, late, delay_s, rate), upper)
     return max(bound_s, _small_gain_of_block(now, late, upper)) if rate == inf else bound_s
 
 

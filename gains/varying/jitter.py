@@ -5,7 +5,7 @@ proved but smaller. For an observed delay (mean, spread, rate of change) `bound_
 least to the most demanding and returns the first that covers it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan, sqrt
 from typing import Literal
@@ -17,7 +17,7 @@ from gains.core._norms import spectral_norms
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.core.structure import balanced, distinct_blocks, seconds, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
 from gains.varying.bounds import varying_delay_bound
@@ -55,13 +55,6 @@ class CoveringBound:
     from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same."""
     bound_s: float
     """The largest delay that this bound admits, nan for "none"."""
-    largest_s: float
-    """The largest delay observed, mean + spread."""
-    constant_margin_s: float
-    rate_bound_s: float
-    spread_bound_s: float
-    any_bound_s: float
-    """The largest delay that each bound admits; 0 if it does not apply (an infinite rate, an unstable mean delay)."""
 
 
 def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
@@ -76,28 +69,20 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
     ['constant', 'none']
     """
     _check(jitter)
-    analysis = analyse_delay(A0, A1)
-    window, largest_s = analysis.window_around(jitter.mean_s), jitter.mean_s + jitter.spread_s
-    spread_s = spread_bound(A0, A1, mean_s=jitter.mean_s, rate=jitter.rate)
-    bounds: dict[Cover, float] = {
-        "rate": varying_delay_bound(A0, A1, rate=jitter.rate) if isfinite(jitter.rate) else 0.0,
-        "spread": jitter.mean_s + spread_s if window else 0.0,
-        "any": varying_delay_bound(A0, A1, rate=inf),
-    }
-    covering: list[tuple[Cover, float]] = [each for each in bounds.items() if largest_s <= each[1]]
+    window = analyse_delay(A0, A1).window_around(jitter.mean_s)
+
+    def bounds() -> Iterator[CoveringBound]:
+        if isfinite(jitter.rate):
+            yield CoveringBound("rate", varying_delay_bound(A0, A1, rate=jitter.rate))
+        if window:
+            spread_s = spread_bound(A0, A1, mean_s=jitter.mean_s, rate=jitter.rate)
+            yield CoveringBound("spread", jitter.mean_s + spread_s)
+        yield CoveringBound("any", varying_delay_bound(A0, A1, rate=inf))
+
+    uncovered, largest_s = CoveringBound("none", nan), jitter.mean_s + jitter.spread_s
     if jitter.spread_s == 0.0:
-        covering = [("constant", window[1])] if window else []
-    covering.append(("none", nan))
-    cover, bound_s = covering[0]
-    return CoveringBound(
-        cover=cover,
-        bound_s=bound_s,
-        largest_s=largest_s,
-        constant_margin_s=analysis.delay_margin_s,
-        rate_bound_s=bounds["rate"],
-        spread_bound_s=bounds["spread"],
-        any_bound_s=bounds["any"],
-    )
+        return CoveringBound("constant", window[1]) if window else uncovered
+    return next((bound for bound in bounds() if largest_s <= bound.bound_s), uncovered)
 
 
 def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf, scaled: bool = True) -> float:
@@ -130,8 +115,7 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
 
 
 def _check(jitter: Jitter) -> None:
-    if not (isfinite(jitter.mean_s) and jitter.mean_s >= 0.0):
-        raise BadModelError(f"mean_s is {jitter.mean_s}; a number of seconds >= 0 is wanted")
+    seconds("mean_s", jitter.mean_s)
     if not 0.0 <= jitter.spread_s <= jitter.mean_s:
         raise BadModelError(f"spread_s is {jitter.spread_s}; 0 to the mean delay of {jitter.mean_s} s is wanted")
     if not jitter.rate >= 0.0:

@@ -46,10 +46,11 @@ from gains.core._bracketing import highest
 from gains.core._norms import spectral_norms
 from gains.core.arrays import BoolArray, ComplexArray, FloatArray
 from gains.core.errors import BadModelError
+from gains.core.structure import seconds
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
 from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
-from gains.sampled.prediction import checked_assumption, checked_mask
+from gains.sampled.prediction import checked_mask
 
 # angles of the grid, and the lowest; how far halvings search; terms of the series in b that are smaller are left out
 _ANGLES, _LOWEST, _HALVINGS, _SMALL = 2000, 1e-4, 50, 1e-9
@@ -90,7 +91,7 @@ class PredictedSpread:
         """
         if not (0.0 <= mean_s < inf and 0.0 <= telemetry_s < inf):
             raise BadModelError(f"mean_s is {mean_s}, telemetry_s {telemetry_s}; numbers of seconds >= 0 are wanted")
-        off_s = mean_s - checked_assumption(self.assumed_s)
+        off_s = mean_s - seconds("assumed_s", self.assumed_s)
         period_s, regular = self.timing.control_s, telemetry_s == 0.0 and self.timing.ticks == 1
         # the age of the newest state, held until the next, and how long none newer is known
         varies_s = 0.0 if regular else 2.0 * telemetry_s + self.timing.telemetry_s

@@ -26,6 +26,7 @@ INTERNAL_FUNCTIONS = {
     "gains.core.structure.is_singular_for_any_delay",
     "gains.core.structure.positive_seconds",
     "gains.core.structure.real_matrix",
+    "gains.core.structure.seconds",
     "gains.core.structure.square_matrices",
     "gains.core.structure.without_equilibria",
     "gains.criteria.parts.parts_of",
@@ -62,7 +63,6 @@ INTERNAL_FUNCTIONS = {
     "gains.performance.scalar_gains.gains_of_margin",
     "gains.performance.scalar_gains.least_singular_value",
     "gains.performance.scalar_gains.onboard_front_gain_limit",
-    "gains.sampled.constant.checked_delay",
     "gains.sampled.constant.checked_loop",
     "gains.sampled.constant.period_map",
     "gains.sampled.constant.spectral_radius",
@@ -76,7 +76,6 @@ INTERNAL_FUNCTIONS = {
     "gains.sampled.multirate.multirate_growth_rate",
     "gains.sampled.multirate.multirate_map",
     "gains.sampled.onboard.local_plant",
-    "gains.sampled.prediction.checked_assumption",
     "gains.sampled.prediction.checked_mask",
 }
 

@@ -63,8 +63,9 @@ def fewest_by_brute_force(blocks: np.ndarray) -> int:
 
 def test_leader_follower_pattern_by_input_is_that_of_the_source() -> None:
     # (4.6), (4.7): {K11}, {K21, K22}, {K32, K33}; K̄ is 6×16, φ2 is 16×10 and stacks x1, x1, x2, x2, x3
-    expanded = expanded_gain(leader_follower(CHAIN), partition_by_input(leader_follower(CHAIN)))
-    assert [graph.links for graph in expanded.partition.subgraphs] == [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
+    partition = partition_by_input(leader_follower(CHAIN))
+    expanded = expanded_gain(leader_follower(CHAIN), partition)
+    assert [graph.links for graph in partition.subgraphs] == [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     assert expanded.mask.shape == (6, 16)
     assert np.array_equal(expanded.phi1, np.eye(6))
     x1, x2, x3 = np.split(np.arange(10.0), [2, 6])

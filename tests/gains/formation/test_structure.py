@@ -60,7 +60,9 @@ def test_union_of_patterns_decides() -> None:
 def test_equal_blocks_are_listed_once() -> None:
     A0 = np.kron(np.eye(3), [[0.0, 1.0], [-1.0, 0.0]])
     A1 = np.kron(np.diag([1.0, 1.0, 2.0]), [[0.0, 0.0], [-0.0, -1.0]])
-    assert [(block.indices.tolist(), block.copies) for block in distinct_blocks(A0, A1)] == [([0, 1], 2), ([4, 5], 1)]
+    own, late = [[0.0, 1.0], [-1.0, 0.0]], [[0.0, 0.0], [0.0, -1.0]]
+    found = [(block.copies, *(matrix.tolist() for matrix in block.matrices)) for block in distinct_blocks(A0, A1)]
+    assert found == [(2, own, late), (1, own, [[0.0, 0.0], [0.0, -2.0]])]
 
 
 def test_balancing_is_an_exact_similarity() -> None:

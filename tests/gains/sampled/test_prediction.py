@@ -8,8 +8,10 @@ from scipy.linalg import expm
 
 from gains import BadModelError, FormationModel, Response, Timing, mismatch_window, rightmost_root
 from gains.core.arrays import FloatArray
+from gains.core.structure import distinct_blocks
 from gains.delay._crossings import DelayedTerm
-from gains.delay._mixed import analyse_mixed
+from gains.delay._mixed import analyse_mixed_block
+from gains.delay._windows import combined_analysis
 from gains.performance.response import formation_loop
 from gains.sampled._loop import HeldPlant, held_blocks
 from gains.sampled.multirate import Predictor, lifted_radius
@@ -233,8 +235,10 @@ def test_both_analyses_of_two_delays_give_one_continuous_window(seed: int) -> No
     A, B, K = follower(k1, k3, lag_s=lag_s)
     assumed_s = float(rng.uniform(0.1, 4.0)) / k1
     late = B @ K @ expm(A * assumed_s)
-    terms = [(A + B @ K, 0.0, 0), (late, 0.0, 1), (-late, assumed_s, 0)]
-    windows = analyse_mixed([DelayedTerm(*term) for term in terms], horizon_s=assumed_s).stable_intervals_s
+    terms = [DelayedTerm(A + B @ K, 0.0, 0), DelayedTerm(late, 0.0, 1), DelayedTerm(-late, assumed_s, 0)]
+    blocks = distinct_blocks(*(term.matrix for term in terms))
+    analysis = combined_analysis([analyse_mixed_block(block, terms, False) for block in blocks], assumed_s)
+    windows = analysis.stable_intervals_s
     wanted = [window for window in windows if window[0] <= assumed_s < window[1]]
     assert wanted == [pytest.approx(mismatch_window_continuous(A, B, K, assumed_s=assumed_s), rel=1e-9)]
 
