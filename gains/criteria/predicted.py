@@ -139,8 +139,7 @@ class PredictedFigures:
             timing = Timing(self.period_s, self.period_s)
             return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
         half_s = self.period_s / 2.0
-        plant = HeldPlant(*self._loop, self.period_s)
-        least_s, most_s = _rough_window(plant, self.assumed_s + half_s, _FREQUENCIES // self.thinned)
+        least_s, most_s = _rough_window(self._plant, self.assumed_s + half_s, _FREQUENCIES // self.thinned)
         return max(0.0, least_s - half_s), most_s - half_s
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:

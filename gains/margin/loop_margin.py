@@ -8,7 +8,7 @@ if there are known delays beside it, `gains.sampled.constant` for a held loop of
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from math import ceil, floor, gcd, inf, lcm, log10, pi
+from math import ceil, floor, gcd, inf, lcm, log10, nan, pi
 
 import numpy as np
 
@@ -227,7 +227,9 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
 
     analysis = analyse_period(*loop)
     crossings = tuple(
-        MarginCrossing(c.omega_rad_s, c.period_s, c.direction, None, None, error_s(c.period_s) if i < _ERRORS_OF else 0)
+        MarginCrossing(
+            c.omega_rad_s, c.period_s, c.direction, None, None, error_s(c.period_s) if i < _ERRORS_OF else nan
+        )
         for i, c in enumerate(analysis.crossings)
     )
     return LoopMargin(
