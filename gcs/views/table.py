@@ -4,6 +4,7 @@
 terminal, and `Display` chooses between the two.
 """
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gains.core.arrays import FloatArray
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.link.startup import WITHOUT_TARGET
@@ -25,7 +27,7 @@ from gcs.plan.design import Design
 from gcs.plan.mismatch import assumption
 from gcs.runs.refusals import REFUSED
 from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, ms_text, not_shown, number_text
-from gcs.views.scene import Floats, Newest
+from gcs.views.scene import Newest
 from scenarios.schema import Scenario
 
 WINDOW_S = 5.0
@@ -35,6 +37,8 @@ EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
 """Equal events within this time share a line."""
 NAMED_MAX = 12
+_NEVER = sys.maxsize
+"""Terminal width from which a column is shown that a flight has no use for."""
 
 HEADROOM_GOOD = 0.3
 """Headroom of at least this much is shown in green."""
@@ -159,12 +163,12 @@ class FlightState:
 class Figures:
     """One value for each vehicle, in the scenario's order; the percentiles and the headroom of the last seconds."""
 
-    spacing_error_m: Floats
-    spacing_m: Floats
-    rtt_s: Floats
-    loop_delay_s_p50: Floats
-    loop_delay_s_p99: Floats
-    headroom: Floats
+    spacing_error_m: FloatArray
+    spacing_m: FloatArray
+    rtt_s: FloatArray
+    loop_delay_s_p50: FloatArray
+    loop_delay_s_p99: FloatArray
+    headroom: FloatArray
     lost: NDArray[np.uint32]
     late: NDArray[np.uint32]
     modes: list[Mode]
@@ -215,23 +219,18 @@ def _progress(state: FlightState, width: int) -> RenderableType:
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
-    assumed: FittedColumn[int] = (
-        "assumed\nms",
-        7,
-        101,
-        lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit=""),
-    )
-    altitude: FittedColumn[int] = ("altitude\nm", 8, 76, lambda k: number_text(-state.newest["down_m"][k], ".1f"))
+    altitude_from = 76 if state.scenario.has_altitude_slots else _NEVER
+    assumed_from = 101 if state.scenario.control.prediction != "off" else _NEVER
     columns: list[FittedColumn[int]] = [
         ("id", 3, 0, lambda k: str(vehicles[k].system_id)),
         ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
-        *([altitude] if state.scenario.has_altitude_slots else []),
+        ("altitude\nm", 8, altitude_from, lambda k: number_text(-state.newest["down_m"][k], ".1f")),
         ("spacing\nerror m", 7, 0, lambda k: number_text(error_m[k], ".2f")),
         ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / figures.spacing_m[k], ".1f")),
         ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),
         ("delay p50\nms", 9, 76, lambda k: ms_text(figures.loop_delay_s_p50[k], unit="")),
         ("delay p99\nms", 9, 0, lambda k: ms_text(figures.loop_delay_s_p99[k], unit="")),
-        *([assumed] if state.scenario.control.prediction != "off" else []),
+        ("assumed\nms", 7, assumed_from, lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit="")),
         ("margin\nms", 6, 101, lambda k: ms_text(state.newest["delay_margin_s"][k], ".0f", unit="")),
         ("headroom\n%", 8, 0, lambda k: headroom_text(headroom[k])),
         ("", 10, 113, lambda k: Text(_bar(headroom[k]), headroom_style(headroom[k]))),
@@ -321,7 +320,7 @@ class Display:
             print(plain_line(state), flush=True)
 
 
-def _quantile(values: Floats, probability: float) -> Floats:
+def _quantile(values: FloatArray, probability: float) -> FloatArray:
     """A quantile (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
 
     As np.nanquantile, which takes a hundred times longer with a NaN in every column.
@@ -331,7 +330,7 @@ def _quantile(values: Floats, probability: float) -> Floats:
     return ordered[place, np.arange(values.shape[1])]
 
 
-def _worst(values: Floats) -> float:
+def _worst(values: FloatArray) -> float:
     return float(np.fmax.reduce(values, initial=np.nan))
 
 
