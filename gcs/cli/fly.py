@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcs.cli import FAILED, INTERRUPTED, options
-from gcs.cli.front import LinksOf, chosen_for, chosen_now, with_link
+from gcs.cli.front import LinksOf, chosen_for, chosen_now
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
@@ -103,11 +103,11 @@ def fly(
         scenario, measured = (
             chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
         )
-        design, plan = flight_plan(scenario)
+        design, plan = flight_plan(scenario, measured)
         if (unstable := preflight.unstable_loop(plan)) is not None:
             options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
             plan = preflight.without_actions(plan)
-        design = with_trade_off(with_link(design, measured))
+        design = with_trade_off(design)
         there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:

@@ -85,11 +85,6 @@ def chosen_now(
     return best_for(scenario, measured_now(scenario, link, start_vehicles=starts, key_file=key_file, shown=shown))
 
 
-def with_link(design: "Design", part: "LinkPart | None") -> "Design":
-    """The design with what was measured of the links."""
-    return design if part is None else design.model_copy(update={"for_link": part})
-
-
 def save_scenario(scenario: "Scenario", file: Path) -> None:
     """Write a scenario that can be flown."""
     from scenarios.files import dump

@@ -138,9 +138,7 @@ def fly_virtual(
     if scenario.control.for_link == "measured":
         delays = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
         scenario, measured = best_for(scenario, delays)
-    design, plan = flight_plan(scenario)
-    if measured is not None:
-        design = design.model_copy(update={"for_link": measured})
+    design, plan = flight_plan(scenario, measured)
     if (unstable := unstable_loop(plan)) is not None:
         _refuse(scenario, None if allow_unstable else unstable)
         plan = without_actions(plan)
