@@ -89,14 +89,11 @@ def _against(result: CampaignResult, onset: Onset) -> str:
     """How far an onset is from what was computed, as far as anything was."""
     if onset.difference is None:
         return ", with no margin to compare it with"
-    text = f", {onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}"
+    limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
+    text = f", {onset.difference:+.3%} from the {limit} of this loop, {_ms(onset.predicted_s)}"
     if onset.predicted_continuous_s is None:
         return text
     return f"{text}; continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
-
-
-def _limit(result: CampaignResult) -> str:
-    return "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:

@@ -282,10 +282,8 @@ def past_limits(scenario: Scenario, own: TickArray) -> bool:
     most_m_s2 = np.minimum(
         limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * np.maximum(speed_m_s, 1e-9)
     )
-    slow, fast = (
-        speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot"),
-        speed_m_s > (limits.speed_max_m_s or np.inf),
-    )
+    slow = speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot")
+    fast = speed_m_s > (limits.speed_max_m_s or np.inf)
     return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
 
 
