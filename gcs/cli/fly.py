@@ -93,11 +93,8 @@ def fly(
         if not virtual:
             link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station")))
             options.warn_if_open(link)
-            to = (
-                None
-                if mirror is None
-                else opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
-            )
+            if mirror is not None:
+                to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
         unmeasured = links_of is None and scenario.control.for_link == "measured"
         there = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
         scenario, measured = (

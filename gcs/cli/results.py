@@ -246,11 +246,8 @@ def print_peers(found: SideBySide) -> None:
         "theirs": lambda row: f"{row.theirs:.3g}",
         "ratio": lambda row: "" if row.ratio is None else f"{row.ratio:.3g}",
     }
-    console.print(
-        table_of(
-            found.rows, columns, title=f"the same work by this station and by others; load {found.load_average:.1f}"
-        )
-    )
+    title = f"the same work by this station and by others; load {found.load_average:.1f}"
+    console.print(table_of(found.rows, columns, title=title))
     for skipped in found.skipped:
         console.print(f"{skipped.peer}: {skipped.why}")
 

@@ -227,7 +227,7 @@ def design(
     if front:
         fronts.show_front(scenario, method, picture, as_json=as_json)
         return
-    scenario = scenario if at is None else fronts.scenario_at(scenario, at, method, maximise, predict)
+    scenario = scenario if at is None else fronts.scenario_at(scenario, at, maximise, predict)
     scenario, measured = chosen_for(scenario, links_of)
     if save is not None:
         fronts.save_scenario(scenario, save)

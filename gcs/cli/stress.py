@@ -228,7 +228,7 @@ def _disturb(
     for delay_s in delays_s:
         plan = replace(plan, scenario=at_coordinates(plan.scenario, {"delay": delay_s}))
     options.refuse(file, refusal(plan.scenario))
-    folder = None if out is None else options.out_folder(out, "a new or empty folder")
+    folder = None if out is None else options.out_folder(out)
 
     def ended() -> None:
         if not as_json and typer.get_text_stream("stderr").isatty():

@@ -178,16 +178,12 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # the design was found for these
         return whole, plan
-    margins_s = (
-        tuple(at_once(margin_steps(plan, responses)))
-        if responses
-        else tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
-    )
-    plan = plan.with_margins(margins_s, responses)
     if responses is not None:
+        plan = plan.with_margins(tuple(at_once(margin_steps(plan, responses))), responses)
         return described(whole, plan), plan
+    margins_s = tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
     continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
-    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan
+    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan.with_margins(margins_s, None)
 
 
 def identified(design: Design, plan: FlightPlan) -> Design:
