@@ -3,13 +3,13 @@
 `gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
 """
 
-from math import inf, isinf, nan
+from math import inf, nan
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field
 
 from gains.core._semidefinite import SolverFacts
-from gains.core.requirement import Requirement
+from gains.core.requirement import Requirement, plain
 from gains.performance.response import Response
 from gcs.published import Published
 from scenarios.schema import GainBlock
@@ -17,11 +17,7 @@ from scenarios.schema import GainBlock
 Matrix = tuple[tuple[float, ...], ...]
 
 
-def _none_if_infinite(margin_s: float | None) -> float | None:
-    return None if margin_s is None or isinf(margin_s) else margin_s
-
-
-Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(_none_if_infinite)]
+Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(plain)]
 """A delay margin in s; None where no delay makes the loop unstable, or where it is not known."""
 
 

@@ -11,7 +11,6 @@ from functools import partial
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -60,9 +59,6 @@ class FlightState:
 
     def __init__(self, scenario: Scenario, design: Design) -> None:
         self.scenario = scenario
-        self.margin_s = np.nan
-        """Delay margin of the fastest gains."""
-        self.margin_unknown = ""
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
@@ -92,6 +88,7 @@ class FlightState:
         self._at_delay: dict[tuple[int, int], str] = {}
         self.margin_unknown = design.margin_unknown
         self.margin_s = np.nan if design.delay_margin_s is None else design.delay_margin_s
+        """Delay margin of the fastest gains."""
 
     def at_delay(self, figures: "Figures") -> str:
         """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
@@ -143,17 +140,12 @@ class FlightState:
         now = self.newest
         heard = self._window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
         loop_delay_s, headroom = (np.where(heard, self._window[name], np.nan) for name in ("loop_delay_s", "headroom"))
-        spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
         late_s = (self._window["sent_ns"].max(axis=1, keepdims=True) - self._window["due_ns"][:, :1]) / 1e9
         return Figures(
             spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
-            spacing_m=np.array(spacings_m),
-            rtt_s=self.rtt_s,
             loop_delay_s_p50=_quantile(loop_delay_s, 0.5),
             loop_delay_s_p99=_quantile(loop_delay_s, 0.99),
             headroom=_quantile(headroom, 0.0),
-            lost=now["lost"],
-            late=now["late"],
             modes=[Mode(int(mode)) for mode in now["mode"]],
             lateness_s_p99=float(_quantile(late_s, 0.99)[0]),
         )
@@ -164,13 +156,9 @@ class Figures:
     """One value for each vehicle, in the scenario's order; the percentiles and the headroom of the last seconds."""
 
     spacing_error_m: FloatArray
-    spacing_m: FloatArray
-    rtt_s: FloatArray
     loop_delay_s_p50: FloatArray
     loop_delay_s_p99: FloatArray
     headroom: FloatArray
-    lost: NDArray[np.uint32]
-    late: NDArray[np.uint32]
     modes: list[Mode]
     lateness_s_p99: float
 
@@ -219,6 +207,7 @@ def _progress(state: FlightState, width: int) -> RenderableType:
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
+    spacing_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in vehicles]
     altitude_from = 76 if state.scenario.has_altitude_slots else _NEVER
     assumed_from = 101 if state.scenario.control.prediction != "off" else _NEVER
     columns: list[FittedColumn[int]] = [
@@ -226,16 +215,16 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
         ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
         ("altitude\nm", 8, altitude_from, lambda k: number_text(-state.newest["down_m"][k], ".1f")),
         ("spacing\nerror m", 7, 0, lambda k: number_text(error_m[k], ".2f")),
-        ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / figures.spacing_m[k], ".1f")),
-        ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),
+        ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / spacing_m[k], ".1f")),
+        ("RTT\nms", 6, 76, lambda k: ms_text(state.rtt_s[k], unit="")),
         ("delay p50\nms", 9, 76, lambda k: ms_text(figures.loop_delay_s_p50[k], unit="")),
         ("delay p99\nms", 9, 0, lambda k: ms_text(figures.loop_delay_s_p99[k], unit="")),
         ("assumed\nms", 7, assumed_from, lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit="")),
         ("margin\nms", 6, 101, lambda k: ms_text(state.newest["delay_margin_s"][k], ".0f", unit="")),
         ("headroom\n%", 8, 0, lambda k: headroom_text(headroom[k])),
         ("", 10, 113, lambda k: Text(_bar(headroom[k]), headroom_style(headroom[k]))),
-        ("lost", 5, 76, lambda k: str(figures.lost[k])),
-        ("late", 5, 76, lambda k: str(figures.late[k])),
+        ("lost", 5, 76, lambda k: str(state.newest["lost"][k])),
+        ("late", 5, 76, lambda k: str(state.newest["late"][k])),
         ("mode", 8, 0, lambda k: Text(figures.modes[k].name, MODE_STYLES[figures.modes[k]])),
     ]
     return fitted_table(order, columns, width=width, gap=1 if width >= 101 else 0)
