@@ -6,9 +6,11 @@
 from math import inf, nan
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from gains.core._semidefinite import SolverFacts
+from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement, plain
 from gains.performance.response import Response
 from gcs.published import Published
@@ -305,11 +307,11 @@ class Design(Published):
     for_link: LinkPart | None = None
 
     @property
-    def inclusion_gains(self) -> tuple[Matrix, Matrix, Matrix] | None:
-        """K1, K2 and K3 of a design by inclusion, None of one on a pattern."""
+    def inclusion_gains(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """K1, K2 and K3 of a design by inclusion, (2, 2) each; None of one on a pattern."""
         if self.K1_1_s is None or self.K2_1_s is None or self.K3_1_s2 is None:
             return None
-        return self.K1_1_s, self.K2_1_s, self.K3_1_s2
+        return np.array(self.K1_1_s), np.array(self.K2_1_s), np.array(self.K3_1_s2)
 
     @property
     def responses(self) -> dict[int, Response]:

@@ -220,9 +220,8 @@ def described(design: Design, plan: FlightPlan) -> Design:
     every = plan.responses.in_order(plan.formation.system_ids)
     continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
     response = known.response
-    if design.inclusion_gains is not None:  # the same for each vehicle, as on a leader-follower tree only
-        own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-        gains, fed = (own, front, spacing), design.feed_forward
+    if (gains := design.inclusion_gains) is not None:  # the same for each vehicle, as on a leader-follower tree only
+        fed = design.feed_forward
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
     schedule = _with_margins(design, plan.margins_s, continuous_s)

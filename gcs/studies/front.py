@@ -170,7 +170,7 @@ def compared(design: Design, name: str) -> Comparison:
     if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
         raise InputError(f"{name}: read another design, wanted {wanted}")
-    K1, K2, K3 = (gain[0][0] for gain in design.inclusion_gains)
+    K1, K2, K3 = (float(gain[0, 0]) for gain in design.inclusion_gains)
     period_s, own, response = design.period_s, ScalarGains(-K1, K2, K3, 0.0), next(iter(answers), None)
 
     def decay_1_s(gains: ScalarGains, assumed_s: float, *delays_s: float) -> float:
