@@ -187,13 +187,11 @@ def _version(name: str) -> str | None:
 
 def _commit() -> str | None:
     """The commit of this checkout, with a + if files have changed since."""
-    git = ("git", "-C", str(Path(__file__).parent))
+    named = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+")
     try:
-        commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True)
+        return subprocess.run(named, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def exact(study: Study, axes: Sequence[Axis]) -> bool:

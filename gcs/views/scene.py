@@ -89,7 +89,7 @@ def tree_of(scenario: Scenario) -> Tree:
     fronts = [index[vehicle.follows] for vehicle in scenario.vehicles if vehicle.follows is not None]
     motion = PlannedMotion(scenario, formation) if scenario.manoeuvres else None
     return Tree(
-        leader=next(k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is None),
+        leader=rows.index(0),
         followers=followers,
         fronts=fronts,
         offsets_m=place_m[followers] - place_m[fronts],
