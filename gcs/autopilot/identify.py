@@ -179,13 +179,8 @@ def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
 
 def _response(name: str, logs: FloatArray) -> Response:
     lag_s, gain, dead_time_s, natural = np.exp(logs).tolist()
-    match name:
-        case "lag":
-            return Response(lag_s, gain)
-        case "lag with dead time":
-            return Response(lag_s, gain, dead_time_s)
-        case _:
-            return Response(lag_s, gain, 0.0, natural)
+    late_s = dead_time_s if name == "lag with dead time" else 0.0
+    return Response(lag_s, gain, late_s, natural if name == "second order" else None)
 
 
 def _misfit(flown: Flown, name: str, logs: FloatArray) -> FloatArray:

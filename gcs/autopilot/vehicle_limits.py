@@ -120,7 +120,8 @@ class Bounds:
         limit = self.acceleration_m_s2(row)
         less_north, less_east = self._braking(row, spacing_error_m, flown, _BRAKING_SHARE * limit)
         north, east = command_m_s2[0] - less_north, command_m_s2[1] - less_east
-        north, east = _shortened(north, east, limit)
+        if (over := hypot(north, east) / limit) > 1.0:
+            north, east = north / over, east / over
         (was_north, was_east), jerk = self._last[row], self._limits[row].jerk_bound_m_s3
         far = hypot(north - was_north, east - was_east) / (jerk * self._period_s)
         if far > 1.0:
@@ -152,8 +153,3 @@ class Bounds:
         counted_m = sqrt(2.0 * braking_m_s2 * (error_m - linear_m / 2.0)) / rate
         less = k3 * (1.0 - counted_m / error_m)
         return less * error_north, less * error_east
-
-
-def _shortened(north: float, east: float, longest: float) -> tuple[float, float]:
-    over = hypot(north, east) / longest
-    return (north / over, east / over) if over > 1.0 else (north, east)

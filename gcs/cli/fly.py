@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcs.cli import FAILED, INTERRUPTED, options
-from gcs.cli.front import LinksOf, chosen_for, chosen_now, with_link
+from gcs.cli.front import LinksOf, chosen_for, chosen_now
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 from scenarios.networks import networks_of
@@ -95,17 +95,18 @@ def fly(
             networks = networks_of(vehicle.system_id for vehicle in scenario.vehicles)
             link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station"), networks))
             options.warn_if_open(link)
-            to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands)) if mirror else None
+            if mirror is not None:
+                to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
         unmeasured = links_of is None and scenario.control.for_link == "measured"
         there = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
         scenario, measured = (
             chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
         )
-        design, plan = flight_plan(scenario)
+        design, plan = flight_plan(scenario, measured)
         if (unstable := preflight.unstable_loop(plan)) is not None:
             options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
             plan = preflight.without_actions(plan)
-        design = with_trade_off(with_link(design, measured))
+        design = with_trade_off(design)
         there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:

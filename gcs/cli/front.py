@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gcs.cli.options import out_file, within
+from gcs.cli.options import answer, out_file, within
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,11 +85,6 @@ def chosen_now(
     return best_for(scenario, measured_now(scenario, link, start_vehicles=starts, key_file=key_file, shown=shown))
 
 
-def with_link(design: "Design", part: "LinkPart | None") -> "Design":
-    """The design with what was measured of the links."""
-    return design if part is None else design.model_copy(update={"for_link": part})
-
-
 def save_scenario(scenario: "Scenario", file: Path) -> None:
     """Write a scenario that can be flown."""
     from scenarios.files import dump
@@ -100,7 +95,6 @@ def save_scenario(scenario: "Scenario", file: Path) -> None:
 
 def show_front(scenario: "Scenario", method: str | None, picture_file: Path | None, *, as_json: bool) -> None:
     """Search the front and print it."""
-    from gcs.cli.options import print_json
     from gcs.studies.front import DELAYS_S, METHODS, front, picture
     from gcs.views.console import progress
 
@@ -116,10 +110,7 @@ def show_front(scenario: "Scenario", method: str | None, picture_file: Path | No
         found = front(scenario, methods, DELAYS_S, workers=os.cpu_count() or 1, ended=begin("front"))
     if picture_file is not None:
         picture(found, picture_file)
-    if as_json:
-        print_json(found)
-    else:
-        _print_front(found)
+    answer(found, _print_front, as_json=as_json)
 
 
 def _print_front(found: "FrontFields") -> None:
@@ -156,7 +147,6 @@ def _print_front(found: "FrontFields") -> None:
 
 def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
     """Compare the loop delays with prediction and without, and print that."""
-    from gcs.cli.options import answer
     from gcs.studies.front import compared
 
     answer(compared(design, name), _print_comparison, as_json=as_json)
@@ -195,15 +185,14 @@ def _print_comparison(found: "Comparison") -> None:
 
 
 def scenario_at(
-    scenario: "Scenario", delay_s: float, method: str | None, maximise: str, predict: Literal["on", "off"] | None
+    scenario: "Scenario", delay_s: float, maximise: str, predict: Literal["on", "off"] | None
 ) -> "Scenario":
-    """The scenario with the gains of a point of the front."""
+    """The scenario with the gains of a point of the front, by its method."""
     from gcs.studies.front import point_at
 
     within("--at", delay_s, 0.001, 10.0, "seconds")
-    asked = method or scenario.control.method
-    own: Method = "graph-lqr" if asked == "graph-lqr" else "inclusion"
-    if asked == "graph-dk":
+    own: Method = "graph-lqr" if scenario.control.method == "graph-lqr" else "inclusion"
+    if scenario.control.method == "graph-dk":
         raise InputError("--method: read graph-dk, wanted inclusion or graph-lqr with --front or --at")
     aim = "alpha_at_delay" if maximise == "alpha" else "decay_rate_at_delay_1_s"
     return point_at(scenario, delay_s, own, aim, predict)[0]

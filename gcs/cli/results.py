@@ -89,14 +89,11 @@ def _against(result: CampaignResult, onset: Onset) -> str:
     """How far an onset is from what was computed, as far as anything was."""
     if onset.difference is None:
         return ", with no margin to compare it with"
-    text = f", {onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}"
+    limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
+    text = f", {onset.difference:+.3%} from the {limit} of this loop, {_ms(onset.predicted_s)}"
     if onset.predicted_continuous_s is None:
         return text
     return f"{text}; continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
-
-
-def _limit(result: CampaignResult) -> str:
-    return "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:
@@ -249,11 +246,8 @@ def print_peers(found: SideBySide) -> None:
         "theirs": lambda row: f"{row.theirs:.3g}",
         "ratio": lambda row: "" if row.ratio is None else f"{row.ratio:.3g}",
     }
-    console.print(
-        table_of(
-            found.rows, columns, title=f"the same work by this station and by others; load {found.load_average:.1f}"
-        )
-    )
+    title = f"the same work by this station and by others; load {found.load_average:.1f}"
+    console.print(table_of(found.rows, columns, title=title))
     for skipped in found.skipped:
         console.print(f"{skipped.peer}: {skipped.why}")
 

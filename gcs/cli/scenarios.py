@@ -8,7 +8,7 @@ import typer
 
 from gcs.cli import front as fronts
 from gcs.cli import options
-from gcs.cli.front import chosen_for, with_link
+from gcs.cli.front import chosen_for
 from gcs.errors import InputError
 from scenarios.networks import MOST_VEHICLES
 
@@ -112,8 +112,7 @@ def check(
     scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
     options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
     scenario, measured = chosen_for(scenario, links_of)
-    design, plan = flight_plan(scenario)
-    design = with_link(design, measured)
+    design, plan = flight_plan(scenario, measured)
     if (unstable := preflight.unstable_loop(plan)) is not None:
         options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     options.answer(checked(plan), partial(_print_check, design), as_json=as_json)
@@ -227,15 +226,14 @@ def design(
     if front:
         fronts.show_front(scenario, method, picture, as_json=as_json)
         return
-    scenario = scenario if at is None else fronts.scenario_at(scenario, at, method, maximise, predict)
+    scenario = scenario if at is None else fronts.scenario_at(scenario, at, maximise, predict)
     scenario, measured = chosen_for(scenario, links_of)
     if save is not None:
         fronts.save_scenario(scenario, save)
-    result, plan = flight_plan(scenario)
+    result, plan = flight_plan(scenario, measured)
     if compare_prediction:
         fronts.show_comparison(result, scenario.name, as_json=as_json)
         return
-    result = with_link(result, measured)
     if (unstable := unstable_loop(plan)) is not None:
         options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     found = with_bounds(with_spread(with_trade_off(result), plan), scenario)

@@ -102,11 +102,10 @@ def stress(
             raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, such as 0.02")
     outlive_readers()
     if disturbance:
-        others = {option: [text for text in texts or () if text] for option, texts in texts_of.items()}
-        others |= {"--resume": resume, "--trial": trial, "--dask": dask, "--real-time": real_time, "--junit": junit}
-        del others["--delay"]
-        if not onset or any(others.values()):
-            read = next((f"and {option}" for option, value in others.items() if value), "without --onset")
+        more = {"--resume": resume, "--trial": trial, "--dask": dask, "--real-time": real_time, "--junit": junit}
+        others = [option for option, value in (*given, *more.items()) if value and option != "--delay"]
+        if not onset or others:
+            read = f"and {others[0]}" if others else "without --onset"
             raise InputError(f"read --disturbance {read}, wanted --disturbance with --onset and at most one --delay")
         study, _ = _study(scenario_file, loop, links, disturbance=True, allow_code=allow_code)
         _disturb(scenario_file, study.plan, delay, tolerance=tolerance, allowed=assert_onset, out=out, as_json=as_json)
@@ -228,7 +227,7 @@ def _disturb(
     for delay_s in delays_s:
         plan = replace(plan, scenario=at_coordinates(plan.scenario, {"delay": delay_s}))
     options.refuse(file, refusal(plan.scenario))
-    folder = None if out is None else options.out_folder(out, "a new or empty folder")
+    folder = None if out is None else options.out_folder(out)
 
     def ended() -> None:
         if not as_json and typer.get_text_stream("stderr").isatty():

@@ -65,9 +65,7 @@ def monitor(
     given, margin_of = _given(margin, design)
     if save_links is not None:
         options.out_file("--save-links", save_links)
-    if (
-        sys.stdout.isatty()
-    ):  # a closed terminal sends a signal; a reader that closes its pipe must still end the command
+    if sys.stdout.isatty():  # a closed one sends a signal; a reader that closes its pipe must still end the command
         outlive_readers()
     with options.listening("--listen", listen, options.opened_guard(key, role="monitor")) as link:
         # the formation is all that is needed of a scenario whose margin is given

@@ -23,25 +23,22 @@ from scenarios.schema import Scenario
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
-    at_delay = figures_at(design, scenario, expected_loop_delay_s(scenario))
-    if at_delay.alpha is None:
+    figures = figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump()
+    if figures["alpha"] is None:
         return design
-    if _is_predicted(design):
-        found = FiguresAtExpectedDelay(**at_delay.model_dump())
-        return design.model_copy(update={"at_loop_delay": found})
-    flown, chains = _flown(design, scenario)
-    requirement = design.requirement
-    peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
-    # where vehicles differ, the least counts
-    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
-    figures = FiguresAtExpectedDelay(
-        **at_delay.model_dump(),
-        alpha_kept=alpha,
-        alpha_kept_to_s=plain(min(formation.alpha_limit_s(alpha) for formation in flown)),
-        string_peak_kept=peak,
-        string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
-    )
-    return design.model_copy(update={"at_loop_delay": figures})
+    if not _is_predicted(design):
+        flown, chains = _flown(design, scenario)
+        requirement = design.requirement
+        peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
+        # where vehicles differ, the least counts
+        alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
+        figures |= {
+            "alpha_kept": alpha,
+            "alpha_kept_to_s": plain(min(formation.alpha_limit_s(alpha) for formation in flown)),
+            "string_peak_kept": peak,
+            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
+        }
+    return design.model_copy(update={"at_loop_delay": FiguresAtExpectedDelay(**figures)})
 
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
@@ -116,7 +113,8 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     if not (own < 0.0 < spacing):
         return []
     scalar = ScalarGains(-own, front * entry.streamed_share, spacing, 0.0)
-    return [FlownLoop(scalar, _timing(design, entry), answer) for answer in set(design.responses.values()) or [None]]
+    timing = flown_timing(design, entry.delay_margin_s)
+    return [FlownLoop(scalar, timing, answer) for answer in set(design.responses.values()) or [None]]
 
 
 def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
@@ -132,12 +130,12 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     return FlownFormation(
         model,
         gain,
-        _timing(design, entry),
+        flown_timing(design, entry.delay_margin_s),
         tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )
 
 
-def _timing(design: Design, entry: GainSet) -> FlownTiming:
-    margin_s = inf if entry.delay_margin_s is None else entry.delay_margin_s
+def flown_timing(design: Design, margin_s: float | None = None) -> FlownTiming:
+    """The timing of a design's loop; `margin_s` as in design.json."""
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
-    return FlownTiming(margin_s, design.period_s, design.loop, step_s)
+    return FlownTiming(inf if margin_s is None else margin_s, design.period_s, design.loop, step_s)

@@ -9,8 +9,8 @@ from gains.core.requirement import plain
 from gains.criteria.bound import alpha_bound
 from gains.criteria.figures import LoopFigures
 from gains.formation.model import FormationModel
-from gains.performance.flown import FlownTiming
 from gains.varying.jitter import Jitter, bound_covering
+from gcs.plan.at_delay import flown_timing
 from gcs.plan.design import CriteriaPart, Design
 from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.formation import plan_formation
@@ -92,8 +92,6 @@ def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
     """The figures of a design's fastest gains, of one axis; None where the loop that flies is another one."""
     if design.prediction is not None or design.feed_forward or design.vehicles < 2 or design.margin_unknown:
         return None
-    step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
-    timing = FlownTiming(inf, design.period_s, design.loop, step_s)
     known = [own.response for own in design.response.vehicles] if design.response else []
     formation = plan_formation(scenario).model
     if design.inclusion_gains is not None:
@@ -106,4 +104,4 @@ def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
     keys = scenario.control.criteria
     delay_s = (keys and keys.at_delay_s) or expected_loop_delay_s(scenario)
     weight, discrete = (keys.weight, keys.discrete) if keys else (None, False)
-    return LoopFigures(model, gain, timing, delay_s, weight, responses, discrete=discrete)
+    return LoopFigures(model, gain, flown_timing(design), delay_s, weight, responses, discrete=discrete)

@@ -3,13 +3,15 @@
 `gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
 """
 
-from math import inf, isinf, nan
+from math import inf, nan
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from gains.core._semidefinite import SolverFacts
-from gains.core.requirement import Requirement
+from gains.core.arrays import FloatArray
+from gains.core.requirement import Requirement, plain
 from gains.performance.response import Response
 from gcs.published import Published
 from scenarios.schema import GainBlock
@@ -17,11 +19,7 @@ from scenarios.schema import GainBlock
 Matrix = tuple[tuple[float, ...], ...]
 
 
-def _none_if_infinite(margin_s: float | None) -> float | None:
-    return None if margin_s is None or isinf(margin_s) else margin_s
-
-
-Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(_none_if_infinite)]
+Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(plain)]
 """A delay margin in s; None where no delay makes the loop unstable, or where it is not known."""
 
 
@@ -309,11 +307,11 @@ class Design(Published):
     for_link: LinkPart | None = None
 
     @property
-    def inclusion_gains(self) -> tuple[Matrix, Matrix, Matrix] | None:
-        """K1, K2 and K3 of a design by inclusion, None of one on a pattern."""
+    def inclusion_gains(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """K1, K2 and K3 of a design by inclusion, (2, 2) each; None of one on a pattern."""
         if self.K1_1_s is None or self.K2_1_s is None or self.K3_1_s2 is None:
             return None
-        return self.K1_1_s, self.K2_1_s, self.K3_1_s2
+        return np.array(self.K1_1_s), np.array(self.K2_1_s), np.array(self.K3_1_s2)
 
     @property
     def responses(self) -> dict[int, Response]:

@@ -101,8 +101,7 @@ def disturbed_formation(
 def _gain(design: Design, model: FormationModel) -> FloatArray | None:
     """K of u = K e; None if the design does not hold it."""
     if design.inclusion_gains is not None:
-        own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-        return fed_forward(model, model.overlapping_gain(own, front, spacing), design.feed_forward)
+        return fed_forward(model, model.overlapping_gain(*design.inclusion_gains), design.feed_forward)
     return None if design.K is None else np.array(design.K)
 
 

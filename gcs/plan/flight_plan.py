@@ -30,14 +30,14 @@ class Responses:
     misfit: Mapping[int, float] = field(default_factory=dict[int, float])
     """The share of each vehicle's velocity that its identified response leaves unexplained."""
 
-    def in_order(self, system_ids: Sequence[int]) -> list[Response]:
+    def in_order(self, system_ids: Sequence[int]) -> tuple[Response, ...]:
         """The responses of these vehicles.
 
         A vehicle that was left out of the flight has none. The response of the last vehicle flown stands in for it,
         which makes no margin smaller: on a tree, all followers have the same gains.
         """
         flown = [system_id for system_id in system_ids if system_id in self.of]
-        return [self.of[system_id if system_id in self.of else flown[-1]] for system_id in system_ids]
+        return tuple(self.of[system_id if system_id in self.of else flown[-1]] for system_id in system_ids)
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,14 @@ class FlightPlan:
         return lambda _: fixed
 
     @property
-    def responses_in_order(self) -> list[Response] | None:
+    def responses_in_order(self) -> tuple[Response, ...] | None:
         """The vehicles' responses in the model's order; None if they are immediate or unknown."""
         return None if self.responses is None else self.responses.in_order(self.formation.system_ids)
 
     def predicted(self, K: FloatArray) -> Predicted:
         """The formation with one of its gains, as it is predicted."""
-        known = self.responses_in_order
-        responses = None if known is None else tuple(known)
-        return Predicted(self.model, K.tobytes(), self.timing, responses, onboard_timing(self.scenario))
+        timing, onboard = self.timing, onboard_timing(self.scenario)
+        return Predicted(self.model, K.tobytes(), timing, self.responses_in_order, onboard)
 
     @property
     def assumed_s(self) -> float | None:

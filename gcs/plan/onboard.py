@@ -71,8 +71,7 @@ def _with_behaviour(design: Design, step_s: float) -> Design:
     """The design with the behaviour of inclusion gains in the onboard loop, at the delay used for the ground loop."""
     if design.inclusion_gains is None or design.behaviour is None:
         return design
-    own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-    found = behaviour((own, front, spacing), design.behaviour.delay_s, own_delay_s=step_s / 2.0)
+    found = behaviour(design.inclusion_gains, design.behaviour.delay_s, own_delay_s=step_s / 2.0)
     return design.model_copy(update={"behaviour": Behaviour.model_validate(plain(asdict(found)))})
 
 

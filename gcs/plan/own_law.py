@@ -160,7 +160,7 @@ def with_unknown_margin(design: Design, plan: FlightPlan, why: str) -> tuple[Des
         entry.model_copy(update=none | {"alpha": None, "decay_rate_1_s": None}) for entry in design.schedule
     )
     kept = {"K1_1_s", "K2_1_s", "K3_1_s2", "K", "links", "period_s", "vehicles", "method", "loop", "pattern", "blocks"}
-    kept |= {"feed_forward", "requirement"}
+    kept |= {"feed_forward", "requirement", "for_link"}
     known = Design(
         **{name: getattr(design, name) for name in kept & design.model_fields_set},
         delay_margin_s=None,

@@ -23,6 +23,7 @@ from gcs.plan.criteria import with_criteria
 from gcs.plan.design import (
     Design,
     GainSet,
+    LinkPart,
     PredictionPart,
     ResponsePart,
     TradeOffPoint,
@@ -57,15 +58,15 @@ MEASURED_WANTED = (
 NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
-
+_REQUIRED = "delay_margin_s", "alpha", "decay_rate_1_s", "string_peak_max", "loop"
 _SHOWN_S = (0.1, 0.3, 0.6, 1.0, 1.5, 3.0)
 """Assumed delays whose windows a design shows, if they tolerate a control period of mismatch."""
 _MORE = 1.1
 """A design whose margin falls short at these rates is repeated for a margin larger by this times the shortfall."""
 
 
-def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
-    """The design of a scenario, and the plan to fly it.
+def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Design, FlightPlan]:
+    """The design of a scenario, with what was measured of its links, and the plan to fly it.
 
     Raises gains.core.errors.GainsError if the scenario's requirement cannot be met.
     """
@@ -75,6 +76,8 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
         design, plan = own_plan(scenario, flight_plan)
     else:
         design, plan = _gains_plan(scenario)
+    if link is not None:
+        design = design.model_copy(update={"for_link": link})
     if scenario.dynamics in BUILT_IN or design.margin_unknown:
         return design, plan
     if scenario.response is None:
@@ -175,16 +178,12 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # the design was found for these
         return whole, plan
-    margins_s = (
-        tuple(at_once(margin_steps(plan, responses)))
-        if responses
-        else tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
-    )
-    plan = plan.with_margins(margins_s, responses)
     if responses is not None:
+        plan = plan.with_margins(tuple(at_once(margin_steps(plan, responses))), responses)
         return described(whole, plan), plan
+    margins_s = tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
     continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
-    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan
+    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan.with_margins(margins_s, None)
 
 
 def identified(design: Design, plan: FlightPlan) -> Design:
@@ -221,9 +220,8 @@ def described(design: Design, plan: FlightPlan) -> Design:
     every = plan.responses.in_order(plan.formation.system_ids)
     continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
     response = known.response
-    if design.inclusion_gains is not None:  # the same for each vehicle, as on a leader-follower tree only
-        own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-        gains, fed = (own, front, spacing), design.feed_forward
+    if (gains := design.inclusion_gains) is not None:  # the same for each vehicle, as on a leader-follower tree only
+        fed = design.feed_forward
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
     schedule = _with_margins(design, plan.margins_s, continuous_s)
@@ -261,11 +259,7 @@ def _design(scenario: Scenario, model: FormationModel, response: Response | None
 def _requirement(scenario: Scenario) -> Requirement:
     control = scenario.control
     return Requirement(
-        delay_margin_s=control.delay_margin_s,
-        alpha=control.alpha,
-        decay_rate_1_s=control.decay_rate_1_s,
-        string_peak_max=control.string_peak_max,
-        loop=control.loop,
+        **{name: getattr(control, name) for name in _REQUIRED},
         feed_forward=control.feed_forward if control.method == "inclusion" else 0.0,
         criteria=None if control.criteria is None else Criteria(**control.criteria.model_dump()),
     )

@@ -40,7 +40,7 @@ def map_figure(
     """
     shown = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes if axis.name != PREDICTION]
     maps = [
-        (_predicting(study, at), _without(at, outcomes), _without(at, verdicts))
+        (_predicting(study, at), _at_assumed(at, outcomes), _at_assumed(at, verdicts))
         for at in next((axis.values for axis in axes if axis.name == PREDICTION), (None,))
     ]
     growth = [_cells(shown, own, "growth_1_s") for _, own, _ in maps]
@@ -66,20 +66,16 @@ def _predicting(study: Study, assumed_s: float | None) -> Study:
     """The study of a station that predicts over this delay, 0 for one that does not; None leaves it as it is."""
     if assumed_s is None:
         return study
-    return replace(
-        study, plan=replace(study.plan, scenario=at_coordinates(study.plan.scenario, {PREDICTION: assumed_s}))
-    )
+    scenario = at_coordinates(study.plan.scenario, {PREDICTION: assumed_s})
+    return replace(study, plan=replace(study.plan, scenario=scenario))
 
 
-def _without(assumed_s: float | None, outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The outcomes at this assumed delay, which is left out of their coordinates."""
-    if assumed_s is None:
-        return list(outcomes)
-    others = [{name: at for name, at in own.coordinates.items() if name != PREDICTION} for own in outcomes]
+def _at_assumed(assumed_s: float | None, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The outcomes at this assumed delay, which is left out of their coordinates; all of a map without such an axis."""
     return [
-        replace(own, coordinates=rest)
-        for own, rest in zip(outcomes, others, strict=True)
-        if own.coordinates[PREDICTION] == assumed_s
+        replace(own, coordinates={name: at for name, at in own.coordinates.items() if name != PREDICTION})
+        for own in outcomes
+        if own.coordinates.get(PREDICTION) == assumed_s
     ]
 
 

@@ -99,7 +99,7 @@ def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | N
 
 
 def run_campaign(
-    trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] | None = None
+    trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] = lambda _: None
 ) -> list[Outcome]:
     """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
@@ -114,8 +114,7 @@ def run_campaign(
                 raise KeyboardInterrupt
             store.add(outcome)
             left -= 1
-            if ended is not None:
-                ended(left)
+            ended(left)
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise

@@ -184,11 +184,10 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         scenario, duration_s = _at_rest(scenario), PROBE_S if plan.assumed_s is None else _HIDDEN_MODE_S
     if not has_constant_links(scenario) and isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
-    row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []
     for vehicle in scenario.vehicles:
-        position = np.array(leader.position_ne_m) + place[row[vehicle.system_id]]
+        position = np.array(leader.position_ne_m) + place[plan.formation.row(vehicle.system_id)]
         velocity = np.array(scenario.nominal_velocity_at(0.0))
         if vehicle.system_id in system_ids:
             k = system_ids.index(vehicle.system_id)
@@ -282,10 +281,8 @@ def past_limits(scenario: Scenario, own: TickArray) -> bool:
     most_m_s2 = np.minimum(
         limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * np.maximum(speed_m_s, 1e-9)
     )
-    slow, fast = (
-        speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot"),
-        speed_m_s > (limits.speed_max_m_s or np.inf),
-    )
+    slow = speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot")
+    fast = speed_m_s > (limits.speed_max_m_s or np.inf)
     return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
 
 

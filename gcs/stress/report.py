@@ -187,13 +187,11 @@ def _version(name: str) -> str | None:
 
 def _commit() -> str | None:
     """The commit of this checkout, with a + if files have changed since."""
-    git = ("git", "-C", str(Path(__file__).parent))
+    named = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+")
     try:
-        commit = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True, check=True)
+        return subprocess.run(named, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def exact(study: Study, axes: Sequence[Axis]) -> bool:
@@ -217,23 +215,19 @@ def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Se
     large = [*own, *(flight for each in onsets for flight in each.own)]
     everything = [*large, *probes, *searched]
 
-    def drawn() -> dict[str, tuple[str, Path | None]]:
+    figures, not_drawn = dict[str, tuple[str, Path | None]](), ""
+    try:
         from gcs.stress.boundary import map_figure
         from gcs.stress.figures import axis_figure, growth_figure, worst_figure
 
         growth = growth_figure(folder / "growth.png", study=study, outcomes=flights, own=large, onset=onset)
-        figures: dict[str, tuple[str, Path | None]] = {"growth": ("Growth of errors against delay", growth)}
+        figures["growth"] = ("Growth of errors against delay", growth)
         if len(axes) == 1 and not fitted:
             figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
         if len(axes) > 1:
             map_ = map_figure(folder / "map.png", study=study, axes=axes, outcomes=points, verdicts=own or points)
             figures["map"] = ("Map", map_)
         figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))
-        return figures
-
-    not_drawn = ""
-    try:
-        figures = drawn()
     except ModuleNotFoundError as error:
         figures, not_drawn = {}, extra_wanted(error.name)
         if not not_drawn:

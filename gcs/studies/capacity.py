@@ -116,9 +116,8 @@ def capacity(
         raise InputError(f"{scenario.name}: dynamics: read {scenario.dynamics!r}, wanted {wanted}")
     scenario = scenario.model_copy(update={"duration_s": seconds})
     formed = _displaced(with_vehicles(scenario, most))
-    for fault in (bad_start(formed), endless_link(formed)):
-        if fault is not None:
-            raise InputError(f"{scenario.name}: {fault}")
+    if fault := bad_start(formed) or endless_link(formed):
+        raise InputError(f"{scenario.name}: {fault}")
     found: list[Capacity] = []
     for k, rate_hz in enumerate(rates_hz):
         own, low, count = Capacity(rate_hz, most=None, next=None), FEWEST - 1, FEWEST

@@ -100,11 +100,9 @@ def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
     make: Any = LocalCluster  # its types allow neither no dashboard nor a cluster that is there at once
     with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
         with dask_workers(cluster.scheduler_address, _not_flown) as answer:
-            for _ in answer(unflown[:1]):  # the workers' imports
-                pass
+            list(answer(unflown[:1]))  # the workers' imports
             used_s = time.process_time()
-            for _ in answer(unflown[1:]):
-                pass
+            list(answer(unflown[1:]))
             central_s = (time.process_time() - used_s) / (len(unflown) - 1)
         with dask_workers(cluster.scheduler_address) as fly:
             begun_s = time.perf_counter()

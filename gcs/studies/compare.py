@@ -105,26 +105,24 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     model, K = plan.model, plan.gain
     squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
     links, numbers = _information(model, K)
-    return (
-        Route(
-            method=method,
-            design_s=design_s,
-            verdict=summary.verdict,
-            settling_time_s=summary.settling_time_s,
-            overshoot=_overshoot(plan, flown),
-            effort_m2_s3=float(squared.sum() / scenario.rates.control_hz),
-            command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))),
-            spacing_error_max_m=summary.spacing_error_max_m,
-            alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
-            delay_margin_s=summary.delay_margin_s,
-            delay_margin_continuous_s=summary.delay_margin_continuous_s,
-            decay_rate_1_s=-abscissa(model.A + model.B @ K),
-            string_peak=string_peak(model, K),
-            links=links,
-            numbers_used=numbers,
-        ),
-        flight.ticks,
+    route = Route(
+        method=method,
+        design_s=design_s,
+        verdict=summary.verdict,
+        settling_time_s=summary.settling_time_s,
+        overshoot=_overshoot(plan, flown),
+        effort_m2_s3=float(squared.sum() / scenario.rates.control_hz),
+        command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))),
+        spacing_error_max_m=summary.spacing_error_max_m,
+        alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
+        delay_margin_s=summary.delay_margin_s,
+        delay_margin_continuous_s=summary.delay_margin_continuous_s,
+        decay_rate_1_s=-abscissa(model.A + model.B @ K),
+        string_peak=string_peak(model, K),
+        links=links,
+        numbers_used=numbers,
     )
+    return route, flight.ticks
 
 
 def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:

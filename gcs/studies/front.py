@@ -7,7 +7,7 @@ the scenario's where vehicles respond with a lag, stable at every constant delay
 of the static gains is no smaller; with a response it is larger.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -77,7 +77,7 @@ def front(
 
     Raises InputError where a front is not defined.
     """
-    search, routes = searched_in(scenario, methods), list(product_of(methods, (False, True), AIMS))
+    search, routes = searched_in(scenario, methods), [Route(*each) for each in product(methods, (False, True), AIMS)]
     left, found = len(routes) * len(delays_s), list[FrontPoint | Refusal]()
     with local_workers(workers, search.point) as each:
         for one in each([(route, delay_s) for delay_s in delays_s for route in routes]):
@@ -93,11 +93,6 @@ def front(
         string_peak_max=scenario.control.string_peak_max,
         points=tuple(every),
     )
-
-
-def product_of(methods: Sequence[Method], predicted: Sequence[bool], aims: Sequence[Aim]) -> Iterator[Route]:
-    """Every route."""
-    return (Route(*each) for each in product(methods, predicted, aims))
 
 
 def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
@@ -133,7 +128,7 @@ def point_at(
     """
     predicted = (False, True) if prediction is None else (prediction == "on",)
     search = searched_in(scenario, (method,))
-    found = [search.point((route, delay_s)) for route in product_of((method,), predicted, (aim,))]
+    found = [search.point((Route(method, own, aim), delay_s)) for own in predicted]
     points = [own for own in found if isinstance(own, FrontPoint)]
     if not points:
         reasons = "; ".join(own.reason for own in found if isinstance(own, Refusal))
@@ -175,7 +170,7 @@ def compared(design: Design, name: str) -> Comparison:
     if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
         raise InputError(f"{name}: read another design, wanted {wanted}")
-    K1, K2, K3 = (gain[0][0] for gain in design.inclusion_gains)
+    K1, K2, K3 = (float(gain[0, 0]) for gain in design.inclusion_gains)
     period_s, own, response = design.period_s, ScalarGains(-K1, K2, K3, 0.0), next(iter(answers), None)
 
     def decay_1_s(gains: ScalarGains, assumed_s: float, *delays_s: float) -> float:

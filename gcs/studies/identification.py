@@ -79,11 +79,9 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
     inside = sample_s >= 0.0
     found = at_once(identify(Flown(1.0 / alone.rates.control_hz, command, sample_s[inside], velocity[inside])))
     if found is None or found.misfit > MISFIT_MAX:
-        read = (
-            "no motion"
-            if found is None
-            else f"{found.misfit:.0%} of its velocity unexplained by {found.response.model}"
-        )
+        read = "no motion"
+        if found is not None:
+            read = f"{found.misfit:.0%} of its velocity unexplained by {found.response.model}"
         raise InputError(f"{scenario.name}: dynamics: read {read} {axis} the course, wanted at most {MISFIT_MAX:.0%}")
     return found
 

@@ -133,16 +133,16 @@ def fly_virtual(
         scenario = load_scenario(scenario)
     if not allow_code and (refused := refusal(scenario, Path(scenario.name))):
         raise InputError(refused)
-    _refuse(scenario, bad_start(scenario) or endless_link(scenario))
+    if fault := bad_start(scenario) or endless_link(scenario):
+        raise InputError(f"{scenario.name}: {fault}")
     measured = None
     if scenario.control.for_link == "measured":
         delays = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
         scenario, measured = best_for(scenario, delays)
-    design, plan = flight_plan(scenario)
-    if measured is not None:
-        design = design.model_copy(update={"for_link": measured})
+    design, plan = flight_plan(scenario, measured)
     if (unstable := unstable_loop(plan)) is not None:
-        _refuse(scenario, None if allow_unstable else unstable)
+        if not allow_unstable:
+            raise InputError(f"{scenario.name}: {unstable}")
         plan = without_actions(plan)
     station = Station(plan, start_ns=START_NS)
     ticks = np.stack(list(fly_lockstep(plan, station=station)))
@@ -150,8 +150,3 @@ def fly_virtual(
         design = described(design, station.plan)
     events = (*station.events, Event(time_s=float(ticks["time_s"][-1, 0]), kind=END, text=station.end_reason))
     return VirtualFlight(scenario, design, summarise(scenario, design, ticks.ravel(), events), ticks, events)
-
-
-def _refuse(scenario: Scenario, finding: str | None) -> None:
-    if finding is not None:
-        raise InputError(f"{scenario.name}: {finding}")

@@ -110,37 +110,24 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
     delay_ms = 1e3 * np.where(sent, flown["loop_delay_s"], np.nan)
     margin_ms = 1e3 * np.where(np.isfinite(flown["delay_margin_s"]), flown["delay_margin_s"], np.nan)
     error_m = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
+    headrooms = chart(
+        time_s,
+        lines(headroom),
+        title="headroom over time",
+        unit="1 − loop delay / margin",
+        levels=levels,
+        least=max(_HEADROOM_LEAST, min(0.0, lowest)),
+        most=1.0,
+    )
+    both_ms = [*lines(delay_ms), *lines(margin_ms, dashed=True)]
+    delays = chart(time_s, both_ms, title="loop delay and delay margin over time", unit="ms", least=0.0)
+    errors = chart(time_s, lines(error_m), title="spacing errors over time", unit="m", least=0.0)
+    reached = "At 0 the loop delay has reached the margin of the gains that are flown."
+    solid = "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; "
     return [
-        (
-            "Headroom",
-            chart(
-                time_s,
-                lines(headroom),
-                title="headroom over time",
-                unit="1 − loop delay / margin",
-                levels=levels,
-                least=max(_HEADROOM_LEAST, min(0.0, lowest)),
-                most=1.0,
-            ),
-            "At 0 the loop delay has reached the margin of the gains that are flown.",
-        ),
-        (
-            "Loop delay and margin",
-            chart(
-                time_s,
-                [*lines(delay_ms), *lines(margin_ms, dashed=True)],
-                title="loop delay and delay margin over time",
-                unit="ms",
-                least=0.0,
-            ),
-            "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; where the monitor takes "
-            "slower gains, it rises.",
-        ),
-        (
-            "Spacing errors",
-            chart(time_s, lines(error_m), title="spacing errors over time", unit="m", least=0.0),
-            "Distance of each follower from its place behind the vehicle in front.",
-        ),
+        ("Headroom", headrooms, reached),
+        ("Loop delay and margin", delays, f"{solid}where the monitor takes slower gains, it rises."),
+        ("Spacing errors", errors, "Distance of each follower from its place behind the vehicle in front."),
     ]
 
 

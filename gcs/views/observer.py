@@ -16,11 +16,11 @@ import select
 import signal
 import sys
 import time  # noqa: TID251 (this process is a driver: it runs at the pace of the flight it watches)
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gcs.control.tick import Event, TickArray
 from gcs.errors import InputError, extra_wanted
 from gcs.output import outlive_readers
 from gcs.plan.design import Design
@@ -122,9 +122,11 @@ def observe(
             if any(event.kind == NEW_DESIGN for event in events):
                 design = read_design(folder / DESIGN_FILE)
                 state.redesigned(design)
-                recording.redesigned(design)
+                if recording is not None:
+                    recording.redesigned(design)
             state.add(ticks, events)
-            recording.add(ticks, events)
+            if recording is not None:
+                recording.add(ticks, events)
             display.events(events)
             now = time.monotonic()
             if ticks.size or events:
@@ -132,7 +134,7 @@ def observe(
             if now >= table_due or ended:
                 display.show(last=ended)
                 table_due = now + TABLE_S
-            if now >= send_due or ended:
+            if recording is not None and (now >= send_due or ended):
                 recording.send()
                 send_due = now + SEND_S
             if not ended:
@@ -182,26 +184,14 @@ class _NoPandas:
             raise ModuleNotFoundError(f"{name} is not used here", name=name)
 
 
-class _NoRecording:
-    """Stands for the recording where Rerun is not installed."""
-
-    def __enter__(self) -> "_NoRecording":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def add(self, ticks: TickArray, events: list[Event]) -> None: ...
-
-    def redesigned(self, design: Design) -> None: ...
-
-    def send(self) -> None: ...
-
-
-def _recording(folder: Path, scenario: Scenario, design: Design, viewer: str | None) -> "Recording | _NoRecording":
+def _recording(
+    folder: Path, scenario: Scenario, design: Design, viewer: str | None
+) -> "AbstractContextManager[Recording | None]":
+    """The recording; None where Rerun is not installed."""
     try:
         from gcs.views.recording import Recording  # Rerun is slow to import
     except ModuleNotFoundError:
-        return _NoRecording()
+        return nullcontext()
     return Recording(folder, scenario, design, viewer)
 
 

@@ -11,22 +11,14 @@ _DPI = 130
 
 
 def rendered(template: str, **values: Any) -> str:
-    """A page of this package, with the filters `ms`, `number` and `percent`."""
+    """A page of this package, with the filters `ms` and `number`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
         loader=PackageLoader("gcs.views", "."), autoescape=select_autoescape(["j2"]), undefined=StrictUndefined
     )
-    environment.filters |= {
-        "ms": partial(ms_text, form=".2f"),
-        "number": number_text,
-        "percent": percent_text,
-    }
+    environment.filters |= {"ms": partial(ms_text, form=".2f"), "number": number_text}
     return environment.get_template(template).render(**values)
-
-
-def percent_text(value: float | None, form: str = "+.3%") -> str:
-    return number_text(value, form)
 
 
 def data_uri(png: Path) -> str:

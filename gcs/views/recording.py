@@ -27,12 +27,13 @@ from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
+from gains.core.arrays import FloatArray
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views import scene
-from gcs.views.scene import Color, Floats
+from gcs.views.scene import Color
 from gcs.views.table import at_once, event_text
 from scenarios.schema import Scenario
 
@@ -87,7 +88,7 @@ class Recording:
         self._modes = np.full(count, -1)
         self._picture_times = scene.PictureTimes(scene.PICTURE_S)
         self._trail_times = scene.PictureTimes(scene.TRAIL_STEP_S)
-        self._trail_ends_m: dict[str, Floats] = {}
+        self._trail_ends_m: dict[str, FloatArray] = {}
         self._stream = rr.RecordingStream("formation-gcs")
         sinks = [rr.FileSink(folder / UNFINISHED_FILE), *([] if viewer is None else [rr.GrpcSink(viewer)])]
         self._is_live = viewer is not None
@@ -131,10 +132,10 @@ class Recording:
         self._stream.disconnect()
         os.replace(self._folder / UNFINISHED_FILE, self._folder / RECORDING_FILE)
 
-    def _columns(self, path: str, times_s: Floats, columns: Any) -> None:
+    def _columns(self, path: str, times_s: FloatArray, columns: Any) -> None:
         self._stream.send_columns(path, [rr.TimeColumn(TIMELINE, duration=times_s)], columns)
 
-    def _scalars(self, path: str, times_s: Floats, values: Floats) -> None:
+    def _scalars(self, path: str, times_s: FloatArray, values: FloatArray) -> None:
         self._columns(path, times_s, rr.Scalars.columns(scalars=values))
 
     def _send_series(self, ticks: TickArray) -> None:
@@ -186,7 +187,7 @@ class Recording:
             for root, place_m in places_m.items():
                 self._send_trail(root, times_s[ends], place_m[ends])
 
-    def _send_places(self, root: str, times_s: Floats, place_m: Floats) -> None:
+    def _send_places(self, root: str, times_s: FloatArray, place_m: FloatArray) -> None:
         count, tree = place_m.shape[1], self._tree
         points = rr.Points3D.columns(positions=place_m.reshape(-1, 3)).partition([count] * times_s.size)
         self._columns(f"{root}/vehicles", times_s, points)
@@ -201,7 +202,7 @@ class Recording:
         centers = rr.Ellipsoids3D.columns(centers=wanted_m.reshape(-1, 3)).partition(lengths)
         self._columns(f"{root}/wanted", times_s, centers)
 
-    def _send_trail(self, root: str, times_s: Floats, place_m: Floats) -> None:
+    def _send_trail(self, root: str, times_s: FloatArray, place_m: FloatArray) -> None:
         """The pieces flown since the ends before, each logged once; the view shows those of the last seconds."""
         ends_m = np.concatenate([self._trail_ends_m.get(root, place_m[:0]), place_m])
         self._trail_ends_m[root] = place_m[-1:]
@@ -282,7 +283,7 @@ def _levels(scenario: Scenario) -> list[Level]:
     return levels + [Level(f"spacing/settled_{k}_m", f"settled: < {end:.2f} m", end) for k, end in enumerate(ends_m)]
 
 
-def _segments(start_m: Floats, end_m: Floats) -> Any:
+def _segments(start_m: FloatArray, end_m: FloatArray) -> Any:
     """Straight lines between points of the same shape (..., 3): (lines, 2, 3)."""
     return np.stack([start_m, end_m], axis=-2).reshape(-1, 2, 3)
 

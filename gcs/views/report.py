@@ -20,7 +20,7 @@ from gcs.plan.design import (
 )
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
-from gcs.runs.summary_record import FlownSpread, LawRecord, Summary, VehicleSummary
+from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
 from scenarios.schema import GainBlock
 
@@ -209,9 +209,9 @@ _VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
 }
 
 
-def print_summary(summary: Summary, folder: Path, console: Console | None = None) -> None:
+def print_summary(summary: Summary, folder: Path) -> None:
     """The verdict with its figures, and where the files are."""
-    console = console or plain_console()
+    console = plain_console()
     print_flight(summary, console)
     console.print(f"files    {folder}: {', '.join(summary.files)}")
     looks = [f"gcs view {folder}"] if RECORDING_FILE in summary.files else []
@@ -228,8 +228,9 @@ def flight_lines(summary: Summary) -> dict[str, str]:
         lines["alpha"] = figures_text(summary.at_loop_delay)
     if summary.code:
         lines["code"] = _code_text(summary.code)
-    if summary.law is not None:
-        lines["law"] = _law_text(summary.law)
+    if (law := summary.law) is not None:
+        slow = "" if law.over_budget is None else f", {law.over_budget} over {1e3 * law.budget_s:g} ms"
+        lines["law"] = f"{law.calls} calls, {law.unusable} without a usable command{slow}"
     if summary.spread is not None and summary.spread.vehicles:
         lines["spread"] = _spread_text(summary.spread)
     if (control := summary.control) is not None:
@@ -328,8 +329,3 @@ def response_text(response: ResponsePart | None) -> str:
 
 def _code_text(code: tuple[CodeRecord, ...]) -> str:
     return ", ".join(f"{each.file}, sha256 {each.sha256[:_HASH]}" for each in code)
-
-
-def _law_text(law: LawRecord) -> str:
-    slow = "" if law.over_budget is None else f", {law.over_budget} over {1e3 * law.budget_s:g} ms"
-    return f"{law.calls} calls, {law.unusable} without a usable command{slow}"

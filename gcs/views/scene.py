@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.core.arrays import FloatArray
 from gcs.control.tick import Mode, TickArray
 from gcs.plan.course import PlannedMotion
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
-Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 PICTURE_S = 0.04
@@ -63,12 +62,12 @@ class Tree:
     followers: list[int]
     fronts: list[int]
     """For each follower, the vehicle that it follows."""
-    offsets_m: Floats
+    offsets_m: FloatArray
     """For each follower, its wanted position relative to that vehicle when the flight begins: (followers, 3), NED."""
-    places_m: Callable[[float], Floats] | None = None
+    places_m: Callable[[float], FloatArray] | None = None
     """The places (vehicles, 3) relative to the leader at a scenario time, if they change in flight."""
 
-    def offsets_at_m(self, times_s: Floats) -> Floats:
+    def offsets_at_m(self, times_s: FloatArray) -> FloatArray:
         """The wanted positions at these times: (times, followers, 3), or (followers, 3) if they are always the same."""
         if self.places_m is None:
             return self.offsets_m
@@ -82,7 +81,7 @@ def tree_of(scenario: Scenario) -> Tree:
     rows = [formation.row(vehicle.system_id) for vehicle in scenario.vehicles]
     down_m = -np.array([[scenario.altitude_of(vehicle)] for vehicle in scenario.vehicles])
 
-    def with_down(place_ne_m: Floats) -> Floats:
+    def with_down(place_ne_m: FloatArray) -> FloatArray:
         return np.hstack([place_ne_m[rows], down_m])
 
     place_m = with_down(formation.place_ne_m())
@@ -90,7 +89,7 @@ def tree_of(scenario: Scenario) -> Tree:
     fronts = [index[vehicle.follows] for vehicle in scenario.vehicles if vehicle.follows is not None]
     motion = PlannedMotion(scenario, formation) if scenario.manoeuvres else None
     return Tree(
-        leader=next(k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is None),
+        leader=rows.index(0),
         followers=followers,
         fronts=fronts,
         offsets_m=place_m[followers] - place_m[fronts],
@@ -98,7 +97,7 @@ def tree_of(scenario: Scenario) -> Tree:
     )
 
 
-def wanted_extent_m(scenario: Scenario) -> tuple[Floats, Floats]:
+def wanted_extent_m(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
     """Centre (north, east) of the wanted formation relative to the leader, and its half extents."""
     place_m = plan_formation(scenario).place_ne_m()
     lowest_m, highest_m = place_m.min(axis=0), place_m.max(axis=0)
@@ -111,7 +110,7 @@ class Newest:
     def __init__(self, *shape: int) -> None:
         self._last = np.full(shape, np.nan)
 
-    def fill(self, values: Floats) -> Floats:
+    def fill(self, values: FloatArray) -> FloatArray:
         """`values` with time as its first axis, its gaps filled; still NaN before the first known value."""
         filled = np.empty_like(values)
         for k, line in enumerate(values):
@@ -126,14 +125,14 @@ class PictureTimes:
         self._step_s = step_s
         self._due_s = -np.inf
 
-    def pick(self, times_s: Floats) -> Iterator[int]:
+    def pick(self, times_s: FloatArray) -> Iterator[int]:
         for k, time_s in enumerate(times_s):
             if time_s >= self._due_s:
                 self._due_s = time_s + self._step_s - 1e-6
                 yield k
 
 
-def positions_m(ticks: TickArray) -> Floats:
+def positions_m(ticks: TickArray) -> FloatArray:
     """Positions (ticks, vehicles, 3), NED, all extrapolated to the instant of their tick.
 
     The states used by one tick were sampled at different instants; at 91 m/s that makes several metres. A state of

@@ -4,19 +4,20 @@
 terminal, and `Display` chooses between the two.
 """
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gains.core.arrays import FloatArray
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.link.startup import WITHOUT_TARGET
@@ -25,7 +26,7 @@ from gcs.plan.design import Design
 from gcs.plan.mismatch import assumption
 from gcs.runs.refusals import REFUSED
 from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, ms_text, not_shown, number_text
-from gcs.views.scene import Floats, Newest
+from gcs.views.scene import Newest
 from scenarios.schema import Scenario
 
 WINDOW_S = 5.0
@@ -35,6 +36,8 @@ EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
 """Equal events within this time share a line."""
 NAMED_MAX = 12
+_NEVER = sys.maxsize
+"""Terminal width from which a column is shown that a flight has no use for."""
 
 HEADROOM_GOOD = 0.3
 """Headroom of at least this much is shown in green."""
@@ -56,9 +59,6 @@ class FlightState:
 
     def __init__(self, scenario: Scenario, design: Design) -> None:
         self.scenario = scenario
-        self.margin_s = np.nan
-        """Delay margin of the fastest gains."""
-        self.margin_unknown = ""
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
@@ -88,6 +88,7 @@ class FlightState:
         self._at_delay: dict[tuple[int, int], str] = {}
         self.margin_unknown = design.margin_unknown
         self.margin_s = np.nan if design.delay_margin_s is None else design.delay_margin_s
+        """Delay margin of the fastest gains."""
 
     def at_delay(self, figures: "Figures") -> str:
         """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
@@ -139,17 +140,12 @@ class FlightState:
         now = self.newest
         heard = self._window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
         loop_delay_s, headroom = (np.where(heard, self._window[name], np.nan) for name in ("loop_delay_s", "headroom"))
-        spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
         late_s = (self._window["sent_ns"].max(axis=1, keepdims=True) - self._window["due_ns"][:, :1]) / 1e9
         return Figures(
             spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
-            spacing_m=np.array(spacings_m),
-            rtt_s=self.rtt_s,
             loop_delay_s_p50=_quantile(loop_delay_s, 0.5),
             loop_delay_s_p99=_quantile(loop_delay_s, 0.99),
             headroom=_quantile(headroom, 0.0),
-            lost=now["lost"],
-            late=now["late"],
             modes=[Mode(int(mode)) for mode in now["mode"]],
             lateness_s_p99=float(_quantile(late_s, 0.99)[0]),
         )
@@ -159,14 +155,10 @@ class FlightState:
 class Figures:
     """One value for each vehicle, in the scenario's order; the percentiles and the headroom of the last seconds."""
 
-    spacing_error_m: Floats
-    spacing_m: Floats
-    rtt_s: Floats
-    loop_delay_s_p50: Floats
-    loop_delay_s_p99: Floats
-    headroom: Floats
-    lost: NDArray[np.uint32]
-    late: NDArray[np.uint32]
+    spacing_error_m: FloatArray
+    loop_delay_s_p50: FloatArray
+    loop_delay_s_p99: FloatArray
+    headroom: FloatArray
     modes: list[Mode]
     lateness_s_p99: float
 
@@ -215,28 +207,24 @@ def _progress(state: FlightState, width: int) -> RenderableType:
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
-    assumed: FittedColumn[int] = (
-        "assumed\nms",
-        7,
-        101,
-        lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit=""),
-    )
-    altitude: FittedColumn[int] = ("altitude\nm", 8, 76, lambda k: number_text(-state.newest["down_m"][k], ".1f"))
+    spacing_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in vehicles]
+    altitude_from = 76 if state.scenario.has_altitude_slots else _NEVER
+    assumed_from = 101 if state.scenario.control.prediction != "off" else _NEVER
     columns: list[FittedColumn[int]] = [
         ("id", 3, 0, lambda k: str(vehicles[k].system_id)),
         ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
-        *([altitude] if state.scenario.has_altitude_slots else []),
+        ("altitude\nm", 8, altitude_from, lambda k: number_text(-state.newest["down_m"][k], ".1f")),
         ("spacing\nerror m", 7, 0, lambda k: number_text(error_m[k], ".2f")),
-        ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / figures.spacing_m[k], ".1f")),
-        ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),
+        ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / spacing_m[k], ".1f")),
+        ("RTT\nms", 6, 76, lambda k: ms_text(state.rtt_s[k], unit="")),
         ("delay p50\nms", 9, 76, lambda k: ms_text(figures.loop_delay_s_p50[k], unit="")),
         ("delay p99\nms", 9, 0, lambda k: ms_text(figures.loop_delay_s_p99[k], unit="")),
-        *([assumed] if state.scenario.control.prediction != "off" else []),
+        ("assumed\nms", 7, assumed_from, lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit="")),
         ("margin\nms", 6, 101, lambda k: ms_text(state.newest["delay_margin_s"][k], ".0f", unit="")),
         ("headroom\n%", 8, 0, lambda k: headroom_text(headroom[k])),
         ("", 10, 113, lambda k: Text(_bar(headroom[k]), headroom_style(headroom[k]))),
-        ("lost", 5, 76, lambda k: str(figures.lost[k])),
-        ("late", 5, 76, lambda k: str(figures.late[k])),
+        ("lost", 5, 76, lambda k: str(state.newest["lost"][k])),
+        ("late", 5, 76, lambda k: str(state.newest["late"][k])),
         ("mode", 8, 0, lambda k: Text(figures.modes[k].name, MODE_STYLES[figures.modes[k]])),
     ]
     return fitted_table(order, columns, width=width, gap=1 if width >= 101 else 0)
@@ -321,7 +309,7 @@ class Display:
             print(plain_line(state), flush=True)
 
 
-def _quantile(values: Floats, probability: float) -> Floats:
+def _quantile(values: FloatArray, probability: float) -> FloatArray:
     """A quantile (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
 
     As np.nanquantile, which takes a hundred times longer with a NaN in every column.
@@ -331,7 +319,7 @@ def _quantile(values: Floats, probability: float) -> Floats:
     return ordered[place, np.arange(values.shape[1])]
 
 
-def _worst(values: Floats) -> float:
+def _worst(values: FloatArray) -> float:
     return float(np.fmax.reduce(values, initial=np.nan))
 
 
