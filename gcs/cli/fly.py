@@ -92,8 +92,13 @@ def fly(
         link = to = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
         if not virtual:
-            networks = networks_of(vehicle.system_id for vehicle in scenario.vehicles)
-            link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station"), networks))
+            link = opened.enter_context(
+                options.listening(
+                    *at,
+                    options.opened_guard(key, role="station"),
+                    networks_of(vehicle.system_id for vehicle in scenario.vehicles),
+                )
+            )
             options.warn_if_open(link)
             if mirror is not None:
                 to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))

@@ -129,7 +129,8 @@ def reference_of(ticks: TickArray) -> Reference:
     """The hash of what is counted, and the end of what is measured."""
     digest = hashlib.sha256()
     for column in COUNTED:
-        digest.update(np.ascontiguousarray(ticks[column]).tobytes())
+        kept = np.uint8 if column == "system_id" else ticks[column].dtype  # of one byte when the hashes were made
+        digest.update(ticks[column].astype(kept).tobytes())
     vehicles = len(np.unique(ticks["system_id"]))
     end = tuple(tuple(round(float(row[name]), 5) for name in MEASURED) for row in ticks[-vehicles:])
     return Reference(digest.hexdigest(), end)
