@@ -279,6 +279,10 @@ def nearest(controls: Records, now_ns: int, down_m: FloatArray | None = None) ->
     return Nearest(*_nearest(controls, now_ns, np.empty(0) if down_m is None else down_m))
 
 
+_ROUNDED_UP = 1.0 + 1e-9
+"""A distance is not larger than this times one that is computed otherwise, whatever was rounded."""
+
+
 @kernel
 def _nearest(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
     """See `nearest`; `down_m` is empty if it does not matter."""
@@ -288,17 +292,27 @@ def _nearest(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray,
         state, age_s = controls[row].state, (now_ns - controls[row].sample_ns) * 1e-9
         north[row], east[row] = state[0] + state[2] * age_s, state[1] + state[3] * age_s
     least, one, two = inf, 0, 0
-    for row in range(n):
-        for other in range(row + 1, n):
-            x, y = north[row] - north[other], east[row] - east[other]
-            square = x * x + y * y
-            if len(down_m):
-                level, below = sqrt(square), down_m[row] - down_m[other]
-                square = level * level + below * below
-            near[row] = min(near[row], square)
-            near[other] = min(near[other], square)
-            if square < least:
-                least, one, two = square, row, other
+    along = north if np.ptp(north) > np.ptp(east) else east  # sorted by this, those far away need no look
+    order = np.argsort(along)
+    for place in range(n):
+        row = order[place]
+        for way in (-1, 1):
+            k = place + way
+            while 0 <= k < n:
+                other = order[k]
+                apart = along[row] - along[other]
+                if apart * apart > near[row] * _ROUNDED_UP:
+                    break
+                x, y = north[row] - north[other], east[row] - east[other]
+                square = x * x + y * y
+                if len(down_m):
+                    level, below = sqrt(square), down_m[row] - down_m[other]
+                    square = level * level + below * below
+                near[row] = min(near[row], square)
+                pair = min(row, other), max(row, other)
+                if square < least or (square == least and pair < (one, two)):
+                    least, (one, two) = square, pair
+                k += way
     for row in range(n):
         near[row] = sqrt(near[row]) if near[row] < inf else nan
     return near, (one, two)

@@ -116,7 +116,7 @@ def fly_in_virtual_time(
             began_s, time_s, flown = time.monotonic(), 0.0, plan
             for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
                 writer.tick(rows)
-                frames = sorted(station.frames + vehicles.take_sent(), key=itemgetter(1))
+                frames = sorted([*station.frames, *vehicles.take_sent()], key=itemgetter(1))
                 writer.frames(frames, EPOCH_NS)
                 for event in station.events:
                     writer.event(event)

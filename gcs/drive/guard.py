@@ -1,7 +1,7 @@
 """Signing at the station's socket: verified datagrams in, signed ones out. The station itself does not sign."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
@@ -52,7 +52,7 @@ class Guard:
                 verified.append(Datagram(good, *datagram[1:]))
         return verified
 
-    def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
+    def sent(self, outgoing: Iterable[Outgoing], now_ns: int) -> list[Outgoing]:
         return [(self._link(address[2]).sign(data, now_ns), address) for data, address in outgoing]
 
 

@@ -13,17 +13,22 @@ from itertools import count
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
-from gcs.link.datagram import Arrival, Datagram, Logged
+from gcs.link.datagram import Address, Arrivals, Block, Logged, Outbox
+from gcs.link.datagram import Datagram as Arrival
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
+from scenarios.kernel import Array, kernel
 from scenarios.keys.link import Links
 from scenarios.networks import network_of
 from scenarios.schema import Scenario
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
+from sim_vehicles.drive.datagrams import Datagram, Datagrams
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
 from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row, TruthLog
@@ -38,8 +43,8 @@ _FLIGHTS_A_COLLECTION = 100
 _flights = count(1)
 _TICKS_TO_PREPARE = 10
 
-Sent = list[tuple[int, bytes, int]]
-"""Datagrams as (system id, bytes, time in ns)."""
+Sent = Datagrams | list[Datagram]
+"""Datagrams from or to vehicles: arrays, or a list; iterated over, both give (system id, bytes, time in ns)."""
 
 
 class Vehicles(Protocol):
@@ -148,20 +153,65 @@ def fly_lockstep(
             gc.collect()
 
 
+class _Bridge:
+    """Passes datagrams between a station and vehicles, whose rows are in order of system id."""
+
+    def __init__(self, system_ids: Sequence[int]) -> None:
+        self._ids = sorted(system_ids)
+        self._addresses: list[Address] = [(_HOST, key, network_of(key)) for key in self._ids]
+        self._row = {address: row for row, address in enumerate(self._addresses)}
+        self._rows = np.array([self._ids.index(key) for key in system_ids])
+        """Those of the station's vehicles."""
+
+    def arrivals(self, sent: Datagrams) -> Arrivals:
+        return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self._addresses)
+
+    def one_by_one(self, sent: Sent) -> list[Arrival]:
+        return [Arrival(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
+
+    def to_vehicles(self, outgoing: Outbox, now_ns: int) -> Datagrams:
+        table, streams = np.empty((4, len(outgoing)), np.int64), [np.empty(0, np.uint8)]
+        place = begin = 0
+        for part in outgoing.parts:
+            if isinstance(part, Block):
+                _enter(table, place, begin, part.frames.shape[1], part.sizes, part.rows, self._rows, now_ns)
+                place += len(part.rows)
+                streams.append(part.frames.ravel())
+            else:
+                data, address = part
+                table[:, place] = begin, begin + len(data), self._row[address], now_ns
+                place += 1
+                streams.append(np.frombuffer(data, np.uint8))
+            begin += len(streams[-1])
+        return Datagrams(np.concatenate(streams), table, self._ids)
+
+
+@kernel
+def _enter(
+    table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, rows_there: Array, now_ns: int
+) -> None:
+    """Enter frames of a width each, the first of which begins at `begin`, into the table of `Datagrams`."""
+    for k in range(len(rows)):
+        table[0, place + k] = begin + k * width
+        table[1, place + k] = begin + k * width + sizes[k]
+        table[2, place + k] = rows_there[rows[k]]
+        table[3, place + k] = now_ns
+
+
 def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:
-    addresses = {key: (_HOST, key, network_of(key)) for key in plan.formation.system_ids}
+    bridge = _Bridge(plan.formation.system_ids)
     to_vehicles: Sent = []
     while station.phase is not Phase.ENDED:
         now_ns = station.next_event_ns
         arrived = vehicles.step(to_vehicles, now_ns)
-        datagrams: Sequence[Arrival] = [(data, addresses[key], time_ns, 0) for key, data, time_ns in arrived]
         if guard is not None:
-            whole = [Datagram(*each) for each in datagrams]
-            datagrams = guard.received(whole, now_ns, station.counters, station.is_another)
-        outgoing, tick = station.step(datagrams, now_ns)
-        if guard is not None:
-            outgoing = guard.sent(outgoing, now_ns)
-        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id, _) in outgoing]
+            datagrams = guard.received(bridge.one_by_one(arrived), now_ns, station.counters, station.is_another)
+            outgoing, tick = station.step(datagrams, now_ns)
+            to_vehicles = [(key, data, now_ns) for data, (_, key, _) in guard.sent(outgoing, now_ns)]
+        else:
+            arrivals = bridge.arrivals(arrived) if isinstance(arrived, Datagrams) else bridge.one_by_one(arrived)
+            outgoing, tick = station.step(arrivals, now_ns)
+            to_vehicles = bridge.to_vehicles(outgoing, now_ns)
         if tick is not None:
-            yield station.complete(tick, [now_ns] * len(outgoing))
+            yield station.complete(tick, np.full(len(outgoing), now_ns))
             station.frames.clear()

@@ -14,7 +14,7 @@ import socket
 import struct
 import time  # noqa: TID251 - this is a driver
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import Self
 
 from gcs.control.phases import Phase
@@ -107,7 +107,7 @@ class StationSocket:
             return self.guard.received(datagrams, clock_ns(), Counter() if refused is None else refused, is_another)
         return datagrams
 
-    def send(self, outgoing: list[Outgoing]) -> list[int]:
+    def send(self, outgoing: Iterable[Outgoing]) -> list[int]:
         """Send datagrams; returns when each had been handed to the kernel, on the station's clock."""
         sent_ns: list[int] = []
         for data, (host, port, network) in outgoing if self.guard is None else self.guard.sent(outgoing, clock_ns()):
@@ -221,12 +221,13 @@ def drive(
         now_ns = clock_ns()
         requests: list[Outgoing] = []
         if station.next_event_ns <= now_ns < station.next_tick_ns:
-            requests, _ = station.step([], now_ns)  # before anything is read: a round trip counts from this step
+            requests = [*station.step([], now_ns)[0]]  # before anything is read: a round trip counts from this step
             link.send(requests)
             log += [(data, now_ns, address) for data, address in requests]
         datagrams = link.receive(station.counters, station.is_another)
         now_ns = clock_ns()
-        outgoing, tick = station.step(datagrams, now_ns)
+        outbox, tick = station.step(datagrams, now_ns)
+        outgoing = [*outbox]
         sent_ns = link.send(outgoing)
         if mirror is not None:
             received = [frame for frame, _, _ in station.frames]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Array, Records, int64, kernel
@@ -274,7 +275,7 @@ _SET_POINT_BYTES = _LAYOUTS[SET_POSITION_TARGET_LOCAL_NED].length
 _HEADER_BYTES = _HEADER.size
 _POSITION_EXTRA, _TIMESYNC_EXTRA = CRC_EXTRA[LOCAL_POSITION_NED][0], CRC_EXTRA[TIMESYNC][0]
 _SET_POINT_EXTRA = CRC_EXTRA[SET_POSITION_TARGET_LOCAL_NED][0]
-_HEARTBEAT_EXTRA, _GLOBAL_EXTRA = CRC_EXTRA[HEARTBEAT][0], CRC_EXTRA[GLOBAL_POSITION_INT][0]
+HEARTBEAT_EXTRA, _GLOBAL_EXTRA = CRC_EXTRA[HEARTBEAT][0], CRC_EXTRA[GLOBAL_POSITION_INT][0]
 
 
 def _crc_step(crc: int, byte: int) -> int:
@@ -312,7 +313,7 @@ def usual_message(data: Array, begin: int, end: int) -> int:
     elif msg_id == TIMESYNC:
         extra = _TIMESYNC_EXTRA
     elif msg_id == HEARTBEAT:
-        extra = _HEARTBEAT_EXTRA
+        extra = HEARTBEAT_EXTRA
     elif msg_id == GLOBAL_POSITION_INT:
         extra = _GLOBAL_EXTRA
     else:
@@ -370,31 +371,32 @@ def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, targe
     _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
 
 
-def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> list[bytes]:
-    """The frames of the set-points of some vehicles, each numbered in a sequence of its own.
+@kernel
+def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> NDArray[np.uint8]:
+    """The frames (m, bytes) of the set-points of some vehicles, each numbered in a sequence of its own.
 
     `points` (SET_POINT), `sequences` and `targets` (their ids in frames) are those of all vehicles; `sequences` is
     advanced.
     """
     frames = np.zeros((len(rows), _OVERHEAD + _SET_POINT_BYTES), np.uint8)
-    _encode_set_points(frames, points, rows, sequences, targets, key_ms)
-    return rows_of(frames)
-
-
-def rows_of(frames: Array) -> list[bytes]:
-    """The rows of an array of bytes."""
-    data, size = frames.tobytes(), frames.shape[1]
-    return [data[begin : begin + size] for begin in range(0, len(data), size)]
-
-
-@kernel
-def _encode_set_points(
-    frames: Array, points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int
-) -> None:
     for place in range(len(rows)):
         row = rows[place]
         sequences[row] = (sequences[row] + 1) & 0xFF
         _encode_set_point(frames[place], points, row, key_ms, targets[row], sequences[row])
+    return frames
+
+
+@kernel
+def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDArray[np.uint8]:
+    """One frame (bytes) to some vehicles, each numbered in a sequence of its own; `extra` is that of its checksum."""
+    size = len(frame)
+    frames = np.empty((len(rows), size), np.uint8)
+    for place in range(len(rows)):
+        row, own = rows[place], frames[place]
+        own[:] = frame
+        own[4] = sequences[row] = (sequences[row] + 1) & 0xFF
+        _put(own, size - 2, np.uint64(checksum(own, 1, size - 2, extra)), 2)
+    return frames
 
 
 REQUEST_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES

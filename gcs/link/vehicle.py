@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcs.link import mavlink
 from gcs.link.clocks import (
@@ -18,7 +19,7 @@ from gcs.link.clocks import (
     request,
     to_station_ns,
 )
-from gcs.link.datagram import Address, Outgoing
+from gcs.link.datagram import Address, Block, Outbox
 from gcs.link.kinds import (
     ARM_DISARM,
     SET_MESSAGE_INTERVAL,
@@ -31,7 +32,7 @@ from gcs.link.kinds import (
     commanded_mode,
     mode_command,
 )
-from gcs.link.mavlink import encode_request
+from gcs.link.mavlink import REQUEST_FRAME_BYTES, encode_request
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
 from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
 from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
@@ -97,29 +98,54 @@ def new_links(n: int) -> Links:
     return Links(known, new_clocks(n), new_counters(n), {}, [None] * n)
 
 
-def addressed(links: Links, rows: Sequence[int], frames: Sequence[bytes]) -> list[Outgoing]:
-    """Frames to the vehicles in these rows, whose addresses are known."""
-    to: list[Any] = links.to
-    return [*zip(frames, [to[row] for row in rows], strict=True)]
+def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key_ms: int) -> Block:
+    """Set-points to the vehicles that are sent one and have been heard; see `gcs.link.mavlink.set_point_frames`."""
+    rows = _heard(links.known, points["sent"])
+    frames = mavlink.set_point_frames(points, rows, links.known["sequence"], targets, key_ms)
+    return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
 
 
-def requests_to(links: Links, rows: Sequence[int], now_ns: int) -> list[bytes]:
-    """The frames of TIMESYNC requests that are sent to some vehicles now."""
-    frames = np.zeros((len(rows), mavlink.REQUEST_FRAME_BYTES), np.uint8)
-    sizes = _ask(frames, links.known, links.clocks.known, links.clocks.pending_ns, np.array(rows, np.int64), now_ns)
-    return [frame[:size] for frame, size in zip(mavlink.rows_of(frames), sizes.tolist(), strict=True)]
+def heartbeats_to(links: Links) -> Block:
+    """A HEARTBEAT of the station to all vehicles that have been heard."""
+    rows = _heard(links.known, np.ones(len(links.to), np.bool_))
+    frames = mavlink.same_frames(_HEARTBEAT, mavlink.HEARTBEAT_EXTRA, rows, links.known["sequence"])
+    return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
+
+
+def requests_to(links: Links, first: int, count: int, now_ns: int) -> Block:
+    """TIMESYNC requests to so many vehicles in turn, from the `first` on, that have been heard."""
+    frames, sizes, rows = _ask(links.known, links.clocks.known, links.clocks.pending_ns, first, count, now_ns)
+    return Block(frames, sizes, rows, links.to)
 
 
 @kernel
-def _ask(frames: Array, known: Records, clocks: Records, pending_ns: Array, rows: Array, now_ns: int) -> Array:
-    """Note the requests and write their frames; returns the sizes of these."""
-    sizes = np.empty(len(rows), np.int64)
-    for place in range(len(rows)):
-        row = rows[place]
+def _heard(known: Records, wanted: Array) -> NDArray[np.int64]:
+    """The rows that are wanted and whose vehicles have been heard."""
+    rows, found = np.empty(len(known), np.int64), 0
+    for row in range(len(known)):
+        if wanted[row] and known[row].address != _NOBODY:
+            rows[found] = row
+            found += 1
+    return rows[:found]
+
+
+@kernel
+def _ask(
+    known: Records, clocks: Records, pending_ns: Array, first: int, count: int, now_ns: int
+) -> tuple[Array, Array, Array]:
+    """Note the requests; returns their frames, the sizes of these and the rows."""
+    frames = np.zeros((count, REQUEST_FRAME_BYTES), np.uint8)
+    sizes, rows, place = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for turn in range(first, first + count):
+        row = turn % len(known)
+        if known[row].address == _NOBODY:
+            continue
+        rows[place] = row
         known[row].sequence = (known[row].sequence + 1) & 0xFF
         ts1_ns = request(clocks[row], pending_ns[row], now_ns)
         sizes[place] = encode_request(frames[place], ts1_ns, known[row].sequence)
-    return sizes
+        place += 1
+    return frames[:place], sizes[:place], rows[:place]
 
 
 @kernel
@@ -141,6 +167,7 @@ def _delivery_at_ns(known: Records, clocks: Records, row: int, key_ms: int, sent
     return delivery_ns(known[row], clocks[row], key_ms, sent_ns)
 
 
+_HEARTBEAT = np.frombuffer(mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0), np.uint8)
 Report = Callable[[str, str, int], None]
 """Takes an event: its kind, its text and the system id of the vehicle."""
 
@@ -282,7 +309,7 @@ class RemoteVehicle:
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
 
-    def send(self, msg_id: int, fields: tuple[Any, ...], outgoing: list[Outgoing]) -> None:
+    def send(self, msg_id: int, fields: tuple[Any, ...], outgoing: Outbox) -> None:
         """Add a frame to the datagrams to be sent, if the vehicle's address is known."""
         if self.address is not None:
             outgoing.append((self.encode(msg_id, fields), self.address))

@@ -25,6 +25,10 @@ from gcs.plan.formation import Formation, on_one_axis, plan_formation
 from scenarios.schema import Scenario
 
 
+_MOST_WHOLE = 50
+"""Largest formation whose α is computed: the work grows with the fourth power of the vehicles, 100 take 40 s."""
+
+
 def with_spread(design: Design, plan: FlightPlan) -> Design:
     """The design with the spread expected at the loop delay of the scenario's links, and α of the whole formation."""
     scenario = plan.scenario
@@ -106,11 +110,11 @@ def _gain(design: Design, model: FormationModel) -> FloatArray | None:
 
 
 def _whole(design: Design, plan: FlightPlan, delay_s: float) -> WholeFigures | None:
-    """α of the whole formation, where the design's own α is that of one follower."""
+    """α of the whole formation, where the design's own α is that of one follower; None for a large formation."""
     if (
         design.margin_unknown
         or design.inclusion_gains is None
-        or design.vehicles < 2
+        or not 2 <= design.vehicles <= _MOST_WHOLE
         or design.loop == "onboard"
         or design.response is not None
     ):

@@ -5,10 +5,8 @@ kernel takes all of these, up to the first datagram that is anything else; that 
 kernels where they apply.
 """
 
-from array import array
 from collections import Counter
 from collections.abc import Sequence
-from itertools import accumulate
 from math import isfinite, nan
 from typing import Any, NamedTuple
 
@@ -20,7 +18,7 @@ from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
 from gcs.link.clocks import MOST_PENDING, UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
-from gcs.link.datagram import Arrival, Datagram, Logged, Outgoing
+from gcs.link.datagram import Address, Arrivals, Datagram, Frames, Outbox, arrivals_of
 from gcs.link.mavlink import (
     HEARTBEAT,
     LOCAL_POSITION_NED,
@@ -112,7 +110,7 @@ class Reception:
         self.reported = new_reported(n)
         self.telemetry_ns = np.zeros(n, np.int64)
         """When the newest state of each vehicle came."""
-        self.frames: list[Logged] = []
+        self.frames = Frames()
         """Frames received since the driver last took them."""
         self.counters: Counter[str] = Counter()
         """Frames that were refused, by reason."""
@@ -123,6 +121,8 @@ class Reception:
         self._row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
             self._row_of[network_of(system_id), wire_id(system_id)] = row
+        self._senders: tuple[int, Sequence[Address], NDArray[np.int64]] = 0, (), np.empty((2, 0), np.int64)
+        """What `_numbered` returned, and how many addresses were known then."""
         self._news_of(1)
 
     def _news_of(self, datagrams: int) -> None:
@@ -144,35 +144,37 @@ class Reception:
         row = self._row.get(system_id_of(datagram.address[2], system_id))
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
-    def take(self, datagrams: Sequence[Arrival], now_ns: int) -> list[Outgoing]:
+    def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int) -> Outbox:
         """Take datagrams in; returns the answers to them."""
-        outgoing: list[Outgoing] = []
-        if not datagrams:
-            return outgoing
-        if _NEWS_OF_A_FRAME * len(datagrams) > len(self._tables.news):
-            self._news_of(len(datagrams))
-        data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True)
-        numbers, known = self._fleet.links.addresses, -1
-        stream, table = np.frombuffer(b"".join(data), np.uint8), np.empty((0, 0), np.int64)
-        networks = np.empty(0, np.int64)
+        outgoing = Outbox()
+        arrivals = datagrams if isinstance(datagrams, Arrivals) else arrivals_of(datagrams)
+        count, place = arrivals.table.shape[1], 0
+        if _NEWS_OF_A_FRAME * count > len(self._tables.news):
+            self._news_of(count)
         now = Now(now_ns, self._start_ns, self._period_ns, self._fleet.loop.heeds_deliveries)
-        place = 0
-        while place < len(datagrams):
-            if len(numbers) != known:  # at first, and when a vehicle has sent from another address
-                known = len(numbers)
-                senders = [numbers.get(address, _NOT_KNOWN) for address in addresses]
-                columns = array("q", [*accumulate(map(len, data)), *senders, *received_ns, *queued_ns])
-                table = np.frombuffer(columns, np.int64)
-                networks = np.array([network for _, _, network in numbers], np.int64)
-            stop = _take_usual(self._tables, stream, table.reshape(4, -1), place, self._row_of, networks, now)
-            self.frames += zip(data[place:stop], received_ns[place:stop], addresses[place:stop], strict=True)
+        while place < count:
+            senders = self._numbered(arrivals.addresses)
+            stop = _take_usual(
+                self._tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self._row_of, senders, now
+            )
+            if stop > place:
+                self.frames.add(arrivals, place, stop)
             self._follow_up(outgoing)
-            if stop < len(datagrams):
-                self._take(Datagram(*datagrams[stop]), now, outgoing)
+            if stop < count:
+                self._take(arrivals.datagram(stop), now, outgoing)
             place = stop + 1
         return outgoing
 
-    def _take(self, datagram: Datagram, now: Now, outgoing: list[Outgoing]) -> None:
+    def _numbered(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
+        """The network of each address, and its number among those that vehicles send from, shape (2, m)."""
+        numbers = self._fleet.links.addresses
+        known, of, senders = self._senders
+        if of is not addresses or senders.shape[1] != len(addresses) or known != len(numbers):
+            own = [[network for _, _, network in addresses], [numbers.get(one, _NOT_KNOWN) for one in addresses]]
+            self._senders = len(numbers), addresses, (senders := np.array(own, np.int64).reshape(2, -1))
+        return senders
+
+    def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:
         """Take in one datagram, whatever it holds."""
         if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
             # once answered in MAVLink 2, the vehicle uses that
@@ -209,7 +211,7 @@ class Reception:
         frame: mavlink.Frame,
         datagram: Datagram,
         now: Now,
-        outgoing: list[Outgoing],
+        outgoing: Outbox,
     ) -> None:
         received_ns = datagram.received_ns
         fields: Any = frame.fields
@@ -244,7 +246,7 @@ class Reception:
                 pass
         vehicle.tell_startup(frame.msg_id, fields)
 
-    def _follow_up(self, outgoing: list[Outgoing]) -> None:
+    def _follow_up(self, outgoing: Outbox) -> None:
         """Do what the kernels have left to do."""
         count = self._tables.news_count.item()
         if not count:
@@ -288,25 +290,23 @@ def _take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
 
 @kernel
 def _take_usual(
-    tables: Tables, stream: Array, datagrams: Array, first: int, row_of: Array, networks: Array, now: Now
+    tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, senders: Array, now: Now
 ) -> int:
     """Take in the datagrams from the `first` on; returns the place of one that is not usual, or their number.
 
-    The rows of `datagrams` say of each where it ends in the stream, the number of its sender's address, when it was
-    received and how long it was queued. `networks` are those of the numbered addresses.
+    Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `_numbered` returns.
     """
-    ends, senders, received_ns, queued_ns = datagrams[0], datagrams[1], datagrams[2], datagrams[3]
-    for place in range(first, len(ends)):
-        begin, end = ends[place - 1] if place else 0, ends[place]
+    for place in range(first, table.shape[1]):
+        begin, end, sender, received_ns = table[0, place], table[1, place], table[2, place], table[3, place]
         msg_id = usual_message(stream, begin, end)
-        if msg_id < 0 or senders[place] < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
+        if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
             return place
-        row = row_of[networks[senders[place]], stream[begin + 5]]
-        if row < 0 or tables.links[row].address != senders[place]:
+        row = row_of[senders[0, sender], stream[begin + 5]]
+        if row < 0 or tables.links[row].address != senders[1, sender]:
             return place
-        if not _take_frame(tables, row, msg_id, stream, begin, end, received_ns[place], queued_ns[place], now):
+        if not _take_frame(tables, row, msg_id, stream, begin, end, received_ns, queued_ns[place], now):
             return place
-    return len(ends)
+    return table.shape[1]
 
 
 @kernel

@@ -19,9 +19,9 @@ from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
-from gcs.link.datagram import Arrival, Outgoing
+from gcs.link.datagram import Arrivals, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import SILENCE_S, RemoteVehicle, addressed, requests_to
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle, heartbeats_to, requests_to, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
@@ -99,7 +99,8 @@ class Station:
         """Why each vehicle is absent, unless it is silent."""
         self._busy = set(range(n))
         """Vehicles for which a command may be due."""
-        self._absent = [""] * n
+        self._absent, self._gone = [""] * n, dict[int, bool]()
+        """Why each vehicle is absent, "" if it is not; those that are, by row, and whether pilots fly them."""
         self._returning: dict[int, bool] = {}
         """Vehicles that take part again, by row, and whether they were far from their places when last looked at. The
         others do without them until they are near."""
@@ -113,7 +114,7 @@ class Station:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._journal.request_stop(reason)
 
-    def step(self, datagrams: Sequence[Arrival], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
+    def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int) -> tuple[Outbox, Tick | None]:
         """Take datagrams in and do what is due.
 
         Returns
@@ -127,14 +128,13 @@ class Station:
             return outgoing, self._tick(outgoing)  # set-points do not wait for what may come in a step of its own
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
-            for vehicle in self.vehicles:
-                vehicle.send(mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
+            outgoing.add(heartbeats_to(self._fleet.links))
         if now_ns >= self._next_requests_ns:
             self._request_timesync(outgoing)
             self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
         return outgoing, None
 
-    def complete(self, tick: Tick, sent_ns: Sequence[int]) -> TickArray:
+    def complete(self, tick: Tick, sent_ns: Sequence[int] | NDArray[np.int64]) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
 
         `sent_ns` says when each datagram of the step was sent. What set-points need not wait for is judged here:
@@ -145,16 +145,16 @@ class Station:
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)
-            away |= {row: why in PILOTED for row, why in enumerate(self._absent) if why}
+            away |= self._gone
             self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
-        # the last one, which index -1 finds, is that of vehicles that were sent none
-        own_ns = np.array([*sent_ns, sent_ns[-1] if sent_ns else self._now_ns])[tick.set_point_indices]
+        at_ns = np.asarray(sent_ns, np.int64) if len(sent_ns) else np.array([self._now_ns])
+        own_ns = at_ns[tick.set_point_indices]  # -1 finds the last one, for vehicles that were sent none
         rows, self._used_s = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
         return rows
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
-    def _tick(self, outgoing: list[Outgoing]) -> Tick:
+    def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
         behind = (self._now_ns - due_ns) // self._period_ns
         self.next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
@@ -192,14 +192,11 @@ class Station:
         self._tick_count += 1 + behind
         return tick
 
-    def _send_set_points(self, points: Records, key_ms: int, outgoing: list[Outgoing]) -> IntArray:
+    def _send_set_points(self, points: Records, key_ms: int, outgoing: Outbox) -> IntArray:
         """Add the set-points to the datagrams to be sent; returns their indices there, -1 for none."""
-        links = self._fleet.links.known
-        rows = (points["sent"] & (links["address"] >= 0)).nonzero()[0]
-        frames = mavlink.set_point_frames(points, rows, links["sequence"], self._targets, key_ms)
-        indices = np.full(len(points), -1)
-        indices[rows] = np.arange(len(outgoing), len(outgoing) + len(rows))
-        outgoing += addressed(self._fleet.links, rows.tolist(), frames)
+        sent, indices = set_points_to(self._fleet.links, points, self._targets, key_ms), np.full(len(points), -1)
+        indices[sent.rows] = np.arange(len(outgoing), len(outgoing) + len(sent.rows))
+        outgoing.add(sent)
         return indices
 
     def _tolerances(self, assumed_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -225,7 +222,7 @@ class Station:
             [why != "" for why in self._absent], [row in self._returning for row in range(len(self._absent))]
         )
 
-    def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
+    def _decide(self, due_ns: int, outgoing: Outbox) -> None:
         """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
         silent = self._now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
@@ -244,6 +241,7 @@ class Station:
                 elif self._absent[row]:
                     self._returning[row] = False
             self._absent = absent
+            self._gone = {row: why in PILOTED for row, why in enumerate(absent) if why}
             self._set_law()
         time_s = self.scenario_time_s(due_ns)
         changes = self._monitor.update(time_s, silent, self._guided, self._critical, self._used_s, flying=flying)
@@ -317,18 +315,14 @@ class Station:
 
     # -- sending and reporting -------------------------------------------------------------------------------------
 
-    def _request_timesync(self, outgoing: list[Outgoing]) -> None:
+    def _request_timesync(self, outgoing: Outbox) -> None:
         """Ask the vehicles whose turn has come for the time on their clocks."""
-        rows: list[int] = []
-        while self._now_ns >= self._next_timesync_ns:
-            rows.append(self._timesync_row)
-            self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
-            self._next_timesync_ns += self._timesync_spacing_ns
-        links = self._fleet.links
-        known = [row for row in rows if links.to[row] is not None]
-        outgoing += addressed(links, known, requests_to(links, known, self._now_ns))
+        due = max(0, (self._now_ns - self._next_timesync_ns) // self._timesync_spacing_ns + 1)
+        outgoing.add(requests_to(self._fleet.links, self._timesync_row, due, self._now_ns))
+        self._timesync_row = (self._timesync_row + due) % len(self.vehicles)
+        self._next_timesync_ns += due * self._timesync_spacing_ns
 
-    def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
+    def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""
         if vehicle.external:
             return

@@ -271,7 +271,8 @@ def station_set_points(count: int, key_ms: int) -> list[bytes]:
     points = np.zeros(count, mavlink.SET_POINT)
     points["type_mask"], points["acceleration_ne_m_s2"] = mavlink.IGNORE_ALL_BUT_ACCELERATION, (0.5, -0.25)
     rows = np.arange(count)
-    return mavlink.set_point_frames(points, rows, np.full(count, -1), np.ones(count, np.int64), key_ms)
+    frames = mavlink.set_point_frames(points, rows, np.full(count, -1), np.ones(count, np.int64), key_ms)
+    return [frame.tobytes() for frame in frames]
 
 
 def pymavlink_set_point(packer: Any, key_ms: int) -> bytes:

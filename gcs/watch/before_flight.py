@@ -100,7 +100,8 @@ def measured_now(
 
 def _watch_virtually(found: _Measurement, scenario: Scenario) -> None:
     requests, vehicles = Requests(_TIMESYNC_HZ, scenario.rates.telemetry_hz), vehicles_of(scenario)
-    now_ns, to_vehicles = START_NS, Sent()
+    now_ns = START_NS
+    to_vehicles: Sent = []
     while not found.is_long_enough(now_ns) and now_ns - START_NS < found.patience_s * NS_PER_S:
         for system_id, data, time_ns in vehicles.step(to_vehicles, now_ns):
             network = network_of(system_id)

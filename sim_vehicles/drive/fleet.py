@@ -6,7 +6,7 @@ same bytes at the same instants.
 
 import heapq
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -18,6 +18,7 @@ from scenarios.kernel import Columns, Records
 from scenarios.keys.link import Links
 from scenarios.schema import NS_PER_S
 from scenarios.signing.link import SignedLink
+from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
 from sim_vehicles.links.queue import Bytes
 from sim_vehicles.links.truth import Record
@@ -34,9 +35,6 @@ from sim_vehicles.vehicles.external import ExternallyFlown
 from sim_vehicles.vehicles.onboard import VehicleLoop
 from sim_vehicles.vehicles.plain import leave_all, next_leaving_ns, run_at, step_all
 from sim_vehicles.vehicles.shell import Change, Radio, Shell
-
-Datagram = tuple[int, bytes, int]
-"""(system id of the vehicle, bytes, host time in ns)"""
 
 _SECTOR = 0
 """In place of a system id: the disturbance that depends on the errors of all vehicles."""
@@ -91,7 +89,7 @@ class Fleet:
         self._columns = Columns(self._vehicles)
         self._waiting = np.zeros((count, 2), np.int64)
         most = max(64, 2 * count)  # datagrams that leave at one time; of more, the kernel returns a part
-        self._leaving, self._leaving_data = np.zeros((most, 4), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
+        self._leaving, self._leaving_data = np.zeros((4, most), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
         self._acts: list[tuple[int, int]] = []
         """(acts_ns, system id), if events run in order of time; stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
@@ -166,41 +164,45 @@ class Fleet:
                 member.vehicle.changes.clear()
         return sorted(changes)
 
-    def step(self, received: Iterable[Datagram], now_ns: int) -> list[Datagram]:
+    def step(self, received: Datagrams | Sequence[Datagram], now_ns: int) -> Datagrams | list[Datagram]:
         """The datagrams that leave the up links by now, with their exact instants, in order of time.
 
         `received` are datagrams of the station, with the instants at which each enters its vehicle's down link.
         """
         if self._links.zero_ns == NEVER_NS or self._external is not None:
-            received = list(received)
             for _, data, time_ns in received:
                 self._links.hear(data, time_ns)
                 self._begin(data, time_ns)
         if self._in_order:
             self._run_in_order(received, now_ns)
             received = ()
-        entering, row_of, ids = list(received), self._rows, self.system_ids
-        numbers = [number for key, data, time_ns in entering for number in (row_of[key], len(data), time_ns)]
-        data = np.frombuffer(b"".join([data for _, data, _ in entering]), np.uint8)
-        edge = data, np.array(numbers, np.int64), self._waiting, self._leaving, self._leaving_data
+        entering = received if isinstance(received, Datagrams) else datagrams_of(received, self._rows)
+        edge = entering.stream, entering.table, self._waiting, self._leaving, self._leaving_data
         entered, waiting, leaving = step_all(*self._arrays(), *edge, 0, now_ns)
         while entered < len(entering):
-            system_id, datagram, time_ns = entering[entered]
-            self._members[system_id].down.send(datagram, time_ns)
+            begin, end, row, time_ns = entering.table[:, entered].tolist()
+            self._in_rows[row].down.send(entering.stream[begin:end].tobytes(), time_ns)
             entered, waiting, leaving = step_all(*self._arrays(), *edge, entered + 1, now_ns)
         out: list[Datagram] = []
         if waiting:
             out = self._run_waiting(waiting, now_ns)
             leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
+        if not out and leaving < self._leaving.shape[1]:
+            return self._left(leaving)
         while leaving:
-            rows: list[list[int]] = self._leaving[:leaving].tolist()
-            left = self._leaving_data[: rows[-1][2]].tobytes()
-            out += [(ids[row], left[begin:end], due_ns) for row, begin, end, due_ns in rows]
-            if leaving < len(self._leaving):
+            out += self._left(leaving)
+            if leaving < self._leaving.shape[1]:
                 break
             leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
+
+    def _left(self, count: int) -> Datagrams:
+        """So many datagrams that the kernel let leave, in order of time and row."""
+        table = self._leaving[:, :count]
+        size = table[1, -1] if count else 0
+        in_order = table.take(table[3].argsort(kind="stable"), axis=1)
+        return Datagrams(self._leaving_data[:size].copy(), in_order, self.system_ids)
 
     def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records]:
         """What the kernels work on."""

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from scenarios.networks import network_of
 from scenarios.schema import NS_PER_S
-from sim_vehicles.drive.fleet import Datagram
+from sim_vehicles.drive.datagrams import Datagram, Datagrams
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """How long before a due time the loop polls the clock instead of sleeping: with few vehicles, late wake-ups are most of
@@ -179,7 +179,7 @@ class Ports:
         system_ids = self._system_ids
         return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
 
-    def send(self, datagrams: list[Datagram]) -> None:
+    def send(self, datagrams: Datagrams | list[Datagram]) -> None:
         for system_id, data, due_ns in datagrams:
             self.sockets.send(self._descriptors[system_id], data, due_ns)
 

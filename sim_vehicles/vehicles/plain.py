@@ -203,20 +203,15 @@ def _enter_all(
 ) -> int:
     """Let datagrams enter their down links, from the first one on; returns the first that cannot, or their number.
 
-    `received` holds the vehicle's row, size and time of each, one after the other, and `data` their bytes.
+    The rows of `received` say of each where it begins and ends in `data`, the vehicle's row, and its time.
     """
-    begin, count = 0, len(received) // 3
-    for k in range(first):
-        begin += received[3 * k + 1]
-    for k in range(first, count):
-        vehicle, size, time_ns = received[3 * k], received[3 * k + 1], received[3 * k + 2]
-        row = row_of(vehicle, LINK_DOWN)
+    for k in range(first, received.shape[1]):
+        begin, size, row = received[0, k], received[1, k] - received[0, k], row_of(received[2, k], LINK_DOWN)
         link = links[row]
         if not link.plain or size > FRAME_BYTES or not ready(link, entries):
             return k
-        enter(link, entries, frames, draws[row], take_in(entries, frames, data, begin, size), time_ns)
-        begin += size
-    return count
+        enter(link, entries, frames, draws[row], take_in(entries, frames, data, begin, size), received[3, k])
+    return received.shape[1]
 
 
 @kernel
@@ -258,21 +253,21 @@ def leave_all(
     data: Bytes,
     now_ns: int,
 ) -> int:
-    """Take datagrams that leave their up links by now; returns how many, at most as many as `leaving` has rows.
+    """Take datagrams that leave their up links by now; returns how many, at most as many as `leaving` has columns.
 
-    `leaving` is (row, begin, end, time) of each, and `data` holds their bytes.
+    The rows of `leaving` say of each where it begins and ends in `data`, the vehicle's row, and its time.
     """
     count = end = 0
     for row in range(len(vehicles)):
         link = links[row_of(row, LINK_UP)]
         while link.next_due_ns <= now_ns and link.under_way > 0:
-            if count == len(leaving):
+            if count == leaving.shape[1]:
                 return count
             entry = take(link, entries)
             begin, end = end, end + entries[entry].size
             copy_bytes(data, begin, frames[entry], 0, entries[entry].size)
-            leaving[count, 0], leaving[count, 1], leaving[count, 2] = row, begin, end
-            leaving[count, 3] = entries[entry].due_ns
+            leaving[0, count], leaving[1, count], leaving[2, count] = begin, end, row
+            leaving[3, count] = entries[entry].due_ns
             count += 1
     return count
 
@@ -298,7 +293,7 @@ def step_all(
     if vehicles wait, nothing leaves yet.
     """
     entered = _enter_all(links, entries, frames, draws, data, received, first)
-    if 3 * entered < len(received):
+    if entered < received.shape[1]:
         return entered, 0, 0
     waits = _run_all(vehicles, links, entries, frames, draws, waiting, now_ns)
     if waits:

@@ -105,12 +105,12 @@ class World:
         """Like `Fleet.step`, with the faults."""
         for _, data, time_ns in received:
             self._note(data, time_ns)
-        received = self._passed(received)
+        received = [*self._passed(received)]
         self._down.extend(data for _, data, _ in received)
         under_fire = self._under_fire(now_ns)
         for system_id in under_fire:
             received += [(system_id, data, now_ns) for data in self._garbage(self._down, TO_VEHICLES)]
-        arrived = self._passed(self.fleet.step(received, now_ns))
+        arrived = [*self._passed(self.fleet.step(received, now_ns))]
         self._up.extend(data for _, data, _ in arrived)
         for system_id, data, time_ns in arrived:
             self.digest.update(b"%d %d " % (system_id, time_ns) + data)

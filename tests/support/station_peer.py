@@ -1,5 +1,6 @@
 """A vehicle played by pymavlink, for the tests of what the station says to it."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -25,7 +26,7 @@ class Peer:
         return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
 
 
-def messages(outgoing: list[Outgoing], kind: str, to: Address = HOME) -> list[Any]:
+def messages(outgoing: Iterable[Outgoing], kind: str, to: Address = HOME) -> list[Any]:
     """The messages of one kind sent to an address, as pymavlink reads them."""
     parser: Any = dialect.MAVLink(None)
     read = [parser.parse_char(data) for data, address in outgoing if address == to]

@@ -336,7 +336,7 @@ def test_px4_starting_in_mavlink_1_is_answered_in_mavlink_2() -> None:
     station.step([Datagram(b"\xfe", HOME, START_NS)], START_NS + 40_000_000)
     assert station.counters == {"bad checksum": 2, "not MAVLink 1": 1, "truncated": 1}
     now_ns = START_NS + 1_100_000_000
-    outgoing = station.step([Datagram(heartbeat * 2, HOME, START_NS)], now_ns)[0] + station.step([], now_ns)[0]
+    outgoing = [*station.step([Datagram(heartbeat * 2, HOME, START_NS)], now_ns)[0], *station.step([], now_ns)[0]]
     assert station.vehicles[1].kind.name == "PX4 multicopter"
     assert all(data[0] == 0xFD for data, _ in outgoing)
     assert messages(outgoing, "HEARTBEAT")

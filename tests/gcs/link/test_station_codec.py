@@ -33,7 +33,7 @@ def test_set_point_is_read_by_pymavlink_as_it_was_meant() -> None:
     points["acceleration_ne_m_s2"][1] = 1.5, -2.25
     [data] = mavlink.set_point_frames(points, np.array([1]), sequences, np.array([2, 3]), 5)
     assert sequences.tolist() == [7, 300 & 0xFF]
-    message = parsed(data)
+    message = parsed(data.tobytes())
     assert message.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
     assert (message.get_srcSystem(), message.get_srcComponent(), message.get_seq()) == (255, 190, 300 & 0xFF)
     assert (message.target_system, message.target_component, message.time_boot_ms) == (3, 1, 5)

@@ -1,5 +1,6 @@
 """The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ GAIN = FORMATION.model.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
 PLAN = FlightPlan(SCENARIO, FORMATION, GAIN, 0.3)
 
 
-def commands(outgoing: list[Outgoing]) -> list[tuple[int, int]]:
+def commands(outgoing: Iterable[Outgoing]) -> list[tuple[int, int]]:
     return [(message.command, message.confirmation) for message in messages(outgoing, "COMMAND_LONG")]
 
 
@@ -64,8 +65,8 @@ def test_a_vehicle_that_does_not_report_its_active_target_is_named_and_flown() -
     station.step([peer.datagram(peer.link.command_ack_encode(511, 0), S)], S + 20 * MS)
     outgoing, _ = station.step([peer.datagram(peer.link.command_ack_encode(511, 2), S)], S + 40 * MS)
     assert [event.system_id for event in station.events if event.text == WITHOUT_TARGET] == [2]
-    outgoing += [frame for k in range(3, 100) for frame in station.step([], S + 20 * MS * k)[0]]
-    assert {command for command, _ in commands(outgoing)} == {176}  # the next step of its start-up
+    later = [frame for k in range(3, 100) for frame in station.step([], S + 20 * MS * k)[0]]
+    assert {command for command, _ in commands([*outgoing, *later])} == {176}  # the next step of its start-up
 
 
 def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:
@@ -120,7 +121,7 @@ def test_a_vehicle_that_counts_its_frames_anew_is_heard() -> None:
 def test_unknown_system_id_is_counted_and_not_answered() -> None:
     station, stranger = Station(PLAN, start_ns=S), Peer(77)
     outgoing, _ = station.step([stranger.heartbeat(S)], S)
-    assert outgoing == []
+    assert not len(outgoing)
     assert station.counters == {"unknown system id": 1}
 
 

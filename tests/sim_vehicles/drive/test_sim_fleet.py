@@ -35,7 +35,7 @@ def requests(now_ns: int) -> list[Datagram]:
 
 def flight(fleet: Fleet, pace_ns: int = 20 * MS) -> list[Datagram]:
     """Two seconds with set-points at 50 Hz, the fleet stepped at a pace of its own: all that it sent."""
-    out = fleet.step(requests(START), START)
+    out = [*fleet.step(requests(START), START)]
     setpoints_ns = START
     for now_ns in range(START + pace_ns, START + 2 * SECOND + 1, pace_ns):
         received: list[Datagram] = []

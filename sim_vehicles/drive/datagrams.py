@@ -1,0 +1,41 @@
+"""Datagrams from and to the vehicles of a fleet, as arrays: few of them are ever looked at one by one."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_vehicles.links.queue import Bytes
+from sim_vehicles.vehicles.plain import Ints
+
+Datagram = tuple[int, bytes, int]
+"""(system id of the vehicle, bytes, host time in ns)"""
+
+
+@dataclass(slots=True)
+class Datagrams:
+    """Datagrams in order; whoever iterates over them gets tuples.
+
+    The rows of `table` (4, n) say of each where it begins and ends in `stream`, the vehicle's row in the fleet, and the
+    time in ns. `system_ids` are those of the rows.
+    """
+
+    stream: Bytes
+    table: Ints
+    system_ids: Sequence[int]
+
+    def __len__(self) -> int:
+        return self.table.shape[1]
+
+    def __iter__(self) -> Iterator[Datagram]:
+        data = self.stream.tobytes()
+        for begin, end, row, time_ns in self.table.T.tolist():
+            yield self.system_ids[row], data[begin:end], time_ns
+
+
+def datagrams_of(datagrams: Sequence[Datagram], rows: Mapping[int, int]) -> Datagrams:
+    """The same datagrams as arrays; `rows` are those of the system ids."""
+    stream = np.frombuffer(bytearray().join([data for _, data, _ in datagrams]), np.uint8)
+    ends = np.cumsum([0, *(len(data) for _, data, _ in datagrams)])
+    numbers = [ends[:-1], ends[1:], [rows[key] for key, _, _ in datagrams], [time_ns for _, _, time_ns in datagrams]]
+    return Datagrams(stream, np.array(numbers, np.int64), [*rows])
