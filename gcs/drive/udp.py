@@ -155,7 +155,7 @@ def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket
         for network in networks:
             own = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             if port + network > _LAST_PORT:
                 raise OSError(errno.EADDRNOTAVAIL, f"there is no port {port + network} for network {network}")
             own.bind((host, port + network if port else 0))

@@ -40,6 +40,7 @@ from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
 
 ARMED = 0x80
+_MOST_NAMED = 10
 STATE_CRITICAL = 5
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
@@ -534,8 +535,10 @@ class RemoteVehicle:
 
 
 def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:
-    """A line that says what each vehicle lacks, beginning with `what`; empty if there are none."""
-    return what + "; ".join(f"vehicle {v.system_id} {v.missing}" for v in vehicles) if vehicles else ""
+    """A line that says what each vehicle lacks, beginning with `what`; empty if there are none. Many are counted."""
+    named = [f"vehicle {v.system_id} {v.missing}" for v in vehicles[:_MOST_NAMED]]
+    named += [f"{len(vehicles) - _MOST_NAMED} others"] if len(vehicles) > _MOST_NAMED else []
+    return what + "; ".join(named) if vehicles else ""
 
 
 def refusals(vehicles: Sequence[RemoteVehicle]) -> str:

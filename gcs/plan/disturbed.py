@@ -24,7 +24,6 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation, on_one_axis, plan_formation
 from scenarios.schema import Scenario
 
-
 _MOST_WHOLE = 50
 """Largest formation whose α is computed: the work grows with the fourth power of the vehicles, 100 take 40 s."""
 

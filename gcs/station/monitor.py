@@ -12,7 +12,6 @@ As headroom shrinks, the monitor acts in this order:
 When the link recovers, these actions are undone in the reverse order.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan, nan
 from typing import NamedTuple
@@ -70,6 +69,10 @@ class Observation(NamedTuple):
     loop_delay_s: float
 
 
+_WAITING = VehicleState()
+"""The state of every vehicle that is not flown and not in its failsafe."""
+
+
 def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
     """The state after one tick.
 
@@ -101,7 +104,7 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
     stay the fastest set and no vehicle is released.
     """
     if not seen.flying:
-        return replace(VehicleState(), mode=Mode.FAILSAFE if seen.failsafe else Mode.WAITING)
+        return replace(_WAITING, mode=Mode.FAILSAFE) if seen.failsafe else _WAITING
     if seen.silent:
         return replace(state, mode=Mode.LOST, pressed_s=None, eased_s=None)
     slowest = len(margins_s) - 1 if policy.act else 0
@@ -219,7 +222,7 @@ class FormationMonitor:
     def __init__(
         self, vehicles: int, margins_s: tuple[float, ...], policy: Monitor, *, separable: bool, period_s: float
     ) -> None:
-        self.states = [VehicleState() for _ in range(vehicles)]
+        self.states = [_WAITING] * vehicles
         self.modes, self.gain_sets = np.zeros(vehicles, np.int64), np.zeros(vehicles, np.int64)
         """Those of `states`."""
         self.released = np.zeros(vehicles, np.bool_)
@@ -259,7 +262,8 @@ class FormationMonitor:
         else:
             self._judged = 0  # before the flight telemetry is slow and the loop is not closed
         changes: list[tuple[int, VehicleState, VehicleState]] = []
-        states, rows = [*self.states], self._not_calm(silent, guided, flying=flying)
+        states = [*self.states]
+        rows = self._not_calm(silent, guided) if flying else self._not_waiting(failsafe)
         delays_s = self._judged_delay_s() if rows else np.empty(0)
         for row in rows:
             before, margins_s = self.states[row], tuple(self.margins_s[row].tolist())
@@ -306,10 +310,13 @@ class FormationMonitor:
         """The vehicles that do not follow their commands, by row."""
         return [row for row, state in self._troubled.items() if state.mode in _AWAY]
 
-    def _not_calm(self, silent: NDArray[np.bool_], guided: NDArray[np.bool_], *, flying: bool) -> Sequence[int]:
-        """The vehicles of which `monitored` may say something new."""
-        if not flying:
-            return range(len(self.states))
+    def _not_waiting(self, failsafe: NDArray[np.bool_]) -> list[int]:
+        """The vehicles of which `monitored` may say something new before the flight and after it."""
+        critical = failsafe.tolist()
+        return [row for row, state in enumerate(self.states) if state is not _WAITING or critical[row]]
+
+    def _not_calm(self, silent: NDArray[np.bool_], guided: NDArray[np.bool_]) -> list[int]:
+        """The same in flight."""
         delays_s, seen, rank = self._delays_s, self._seen, self._rank
         if not self._separable:
             delays_s, seen, rank = self._judged_delay_s()[:, None], 1, 0

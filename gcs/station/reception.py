@@ -169,9 +169,14 @@ class Reception:
         """The network of each address, and its number among those that vehicles send from, shape (2, m)."""
         numbers = self._fleet.links.addresses
         known, of, senders = self._senders
-        if of is not addresses or senders.shape[1] != len(addresses) or known != len(numbers):
+        if of is not addresses or senders.shape[1] != len(addresses):
             own = [[network for _, _, network in addresses], [numbers.get(one, _NOT_KNOWN) for one in addresses]]
-            self._senders = len(numbers), addresses, (senders := np.array(own, np.int64).reshape(2, -1))
+            senders = np.array(own, np.int64).reshape(2, -1)
+        else:
+            for address in [*numbers][known:]:
+                if address in addresses:
+                    senders[1, addresses.index(address)] = numbers[address]
+        self._senders = len(numbers), addresses, senders
         return senders
 
     def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:

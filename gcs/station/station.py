@@ -36,6 +36,8 @@ from scenarios.schema import NS_PER_S
 _HEARTBEAT_NS = NS_PER_S
 _REQUESTS_APART_NS = 7_000_000
 """Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
+_IN_A_TICK = 250
+"""Vehicles whose start-up is looked after at one tick; of more, these take turns."""
 _NEAR = 0.1
 """A vehicle that returns is near its place within this share of the spacing error limit."""
 
@@ -97,7 +99,7 @@ class Station:
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
-        self._busy = set(range(n))
+        self._rows, self._ready, self._busy = range(n), 0, set(range(n))
         """Vehicles for which a command may be due."""
         self._absent, self._gone = [""] * n, dict[int, bool]()
         """Why each vehicle is absent, "" if it is not; those that are, by row, and whether pilots fly them."""
@@ -176,7 +178,7 @@ class Station:
         self._limits.limit(points)  # last, so that it holds whoever computed them
         self._fleet.loop.sent(due_ns, points)
         indices = self._send_set_points(points, key_ms, outgoing)
-        for row in sorted(self._busy):
+        for row in self._in_turn(sorted(self._busy)):
             frame = self.vehicles[row].next_frame(self._now_ns)
             if frame is not None and (address := self.vehicles[row].address) is not None:
                 outgoing.append((frame, address))
@@ -226,7 +228,7 @@ class Station:
         """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
         silent = self._now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
-        self._look_at(self._reception.touched if flying else range(len(self.vehicles)))
+        self._look_at(self._reception.touched if flying else self._reception.touched | {*self._in_turn(self._rows)})
         self._reception.touched.clear()
         absent = [*self._why_absent] if flying else [""] * len(self.vehicles)
         for row in silent.nonzero()[0].tolist() if flying else ():
@@ -262,6 +264,21 @@ class Station:
                 self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
         self._next_phase(due_ns)
 
+    def _in_turn(self, rows: Sequence[int]) -> Sequence[int]:
+        """Those of many rows whose turn it is at this tick: start-up takes 20 µs a vehicle."""
+        first = self._tick_count * _IN_A_TICK % max(1, len(rows))
+        return rows if len(rows) <= _IN_A_TICK else [*rows, *rows][first : first + _IN_A_TICK]
+
+    def _all_ready(self) -> bool:
+        """Whether all vehicles are ready or left out; looks first at the one that was not at the last call."""
+
+        def ready(row: int) -> bool:
+            vehicle = self.vehicles[row]
+            return vehicle.left_out or (vehicle.ready and bool(self._history.newest(row)))
+
+        self._ready = next((row for row in self._rows[self._ready :] if not ready(row)), 0)
+        return ready(self._ready) and all(map(ready, self._rows))
+
     def _look_at(self, rows: Iterable[int]) -> None:
         """Take in what may have changed of vehicles."""
         for row in rows:
@@ -283,9 +300,7 @@ class Station:
             self.request_stop(end_reason(self.vehicles, self._absent))
         if self.phase is Phase.FLYING and not self._journal.stop:
             return
-        all_ready = self.phase is Phase.CONNECTING and all(
-            v.left_out or (v.ready and self._history.newest(row)) for row, v in enumerate(self.vehicles)
-        )
+        all_ready = self.phase is Phase.CONNECTING and self._all_ready()
         if all_ready:
             self.request_stop(not_formed(self.plan, self._history))
         phase = next_phase(
