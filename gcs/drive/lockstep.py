@@ -18,8 +18,8 @@ import numpy as np
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
+from gcs.link import datagram
 from gcs.link.datagram import Address, Arrivals, Block, Logged, Outbox
-from gcs.link.datagram import Datagram as Arrival
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
 from scenarios.kernel import Array, kernel
@@ -166,8 +166,8 @@ class _Bridge:
     def arrivals(self, sent: Datagrams) -> Arrivals:
         return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self._addresses)
 
-    def one_by_one(self, sent: Sent) -> list[Arrival]:
-        return [Arrival(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
+    def one_by_one(self, sent: Sent) -> list[datagram.Datagram]:
+        return [datagram.Datagram(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
 
     def to_vehicles(self, outgoing: Outbox, now_ns: int) -> Datagrams:
         table, streams = np.empty((4, len(outgoing)), np.int64), [np.empty(0, np.uint8)]

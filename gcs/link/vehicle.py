@@ -535,7 +535,7 @@ class RemoteVehicle:
 
 
 def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:
-    """A line that says what each vehicle lacks, beginning with `what`; empty if there are none. Many are counted."""
+    """A line that says what vehicles lack, beginning with `what`; empty if there are none. Of many, ten are named."""
     named = [f"vehicle {v.system_id} {v.missing}" for v in vehicles[:_MOST_NAMED]]
     named += [f"{len(vehicles) - _MOST_NAMED} others"] if len(vehicles) > _MOST_NAMED else []
     return what + "; ".join(named) if vehicles else ""

@@ -3,7 +3,7 @@
 from gcs.link import mavlink
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
-from gcs.link.vehicle import RemoteVehicle
+from gcs.link.vehicle import RemoteVehicle, in_words
 from scenarios.schema import NS_PER_S
 
 ACCEPTED = (SET_MESSAGE_INTERVAL, 0, 0, 0, 0, 0)
@@ -53,3 +53,12 @@ def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
         vehicle.heard_ns = k * NS_PER_S
         assert requested(vehicle.next_frame(k * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
     assert "telemetry rate" in vehicle.missing
+
+
+def test_a_line_about_many_vehicles_names_ten_of_them() -> None:
+    vehicles = [RemoteVehicle(k + 1, startup=LaunchedStartup(50.0)) for k in range(1000)]
+    line = in_words("not ready: ", vehicles)
+    assert line.startswith("not ready: vehicle 1 not heard; vehicle 2 not heard; ")
+    assert line.endswith("; vehicle 10 not heard; 990 others")
+    assert in_words("not ready: ", vehicles[:2]) == "not ready: vehicle 1 not heard; vehicle 2 not heard"
+    assert in_words("not ready: ", []) == ""

@@ -76,7 +76,7 @@ def test_a_leader_has_no_spacing_error() -> None:
     assert row_of(drawn(flown(line(3))), 3)[:4] == ["3", "–", "–", "–"]
 
 
-@pytest.mark.parametrize("count", [1, 20, 250])
+@pytest.mark.parametrize("count", [1, 20, 250, 1000])
 @pytest.mark.parametrize(("width", "height"), [(40, 20), (60, 20), (80, 24), (100, 30), (120, 40), (200, 60)])
 def test_the_table_fits_every_terminal(count: int, width: int, height: int) -> None:
     state = flown(line(count))

@@ -9,6 +9,7 @@ from gcs.plan.design import Design
 from gcs.runs.files import write_design
 from gcs.runs.record import SCENARIO_FILE, RunWriter
 from scenarios import files
+from scenarios.networks import ids_of
 from scenarios.schema import NominalVelocity, Scenario, Vehicle
 
 DESIGN = Design(delay_margin_s=0.4, delay_margin_continuous_s=0.41)
@@ -18,10 +19,11 @@ PERIOD_S = 0.02
 
 def line(count: int) -> Scenario:
     """A scenario of `count` vehicles in line, 30 m behind and 40 m aside of each other."""
+    ids = ids_of(count)[::-1]  # so that the scenario's order is not that of the system ids
     vehicles = tuple(
         Vehicle(
-            system_id=count - k,  # so that the scenario's order is not that of the system ids
-            follows=None if k == 0 else count - k + 1,
+            system_id=ids[k],
+            follows=None if k == 0 else ids[k - 1],
             offset_ne_m=None if k == 0 else (-30.0, 40.0),
             position_ne_m=(-30.0 * k, 40.0 * k),
             velocity_ne_m_s=(SPEED_M_S, 0.0),
