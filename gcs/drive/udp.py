@@ -119,6 +119,7 @@ class StationSocket:
         return sent_ns
 
     def _receive(self, network: int, datagrams: list[Datagram]) -> None:
+        """Add the waiting datagrams of a network."""
         own, oldest_ns = self._sockets[network], self._emptied_ns[network]
         begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
         for _ in range(_DATAGRAMS_A_STEP):
@@ -145,7 +146,7 @@ def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.so
     for _ in range(_PORTS_TO_TRY):
         with contextlib.suppress(OSError):
             return _bound_at(host, port, networks)
-    raise OSError(errno.EADDRINUSE, "no free ports in a row")
+    return _bound_at(host, port, networks)  # the error that comes now is reported
 
 
 def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:

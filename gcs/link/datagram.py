@@ -1,7 +1,7 @@
 """Datagrams as the station receives and sends them: one by one, or many together as arrays.
 
-Many are kept as the bytes of all, one after the other, and a table that says where each is. Only who looks at one makes
-`bytes` of it.
+Many are kept as one array of bytes and a table that says where each begins and ends. An object `bytes` is made only of
+a datagram that somebody reads.
 """
 
 from collections.abc import Iterator, Sequence
@@ -70,7 +70,7 @@ class Frames:
         self._parts.append(frame)
 
     def add(self, arrivals: Arrivals, first: int, stop: int) -> None:
-        """Add datagrams from one place to another, of one frame each."""
+        """Add the datagrams from the place `first` up to `stop`, each of one frame."""
         self._parts.append(arrivals._replace(table=arrivals.table[:, first:stop]))
 
     def clear(self) -> None:
@@ -99,7 +99,7 @@ class Block:
 
 
 class Outbox:
-    """Datagrams to be sent, in order: (bytes, address) to who reads them one by one."""
+    """Datagrams to be sent, in order. Iterating over it gives (bytes, address) of each."""
 
     def __init__(self) -> None:
         self.parts: list[Outgoing | Block] = []

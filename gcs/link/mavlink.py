@@ -388,7 +388,10 @@ def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Ar
 
 @kernel
 def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDArray[np.uint8]:
-    """One frame (bytes) to some vehicles, each numbered in a sequence of its own; `extra` is that of its checksum."""
+    """Copies (m, bytes) of a frame for some vehicles, each numbered in a sequence of its own.
+
+    `extra` is the CRC_EXTRA byte of the message.
+    """
     size = len(frame)
     frames = np.empty((len(rows), size), np.uint8)
     for place in range(len(rows)):

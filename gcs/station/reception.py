@@ -335,7 +335,7 @@ def _take_frame(
     elif msg_id == TIMESYNC:
         known = tc1_ns != 0  # a reply
     elif msg_id == HEARTBEAT:
-        same = unsigned_at(stream, payload, 8, payload_end) == link.heartbeat
+        same = link.heartbeat != 0 and unsigned_at(stream, payload, 8, payload_end) == link.heartbeat
         known = link.launched and same and received_ns - link.heartbeat_ns <= FORGET_NUMBERS_NS
     else:
         known = link.launched

@@ -265,7 +265,7 @@ class Station:
         self._next_phase(due_ns)
 
     def _in_turn(self, rows: Sequence[int]) -> Sequence[int]:
-        """Those of many rows whose turn it is at this tick: start-up takes 20 µs a vehicle."""
+        """The rows to look after at this tick: all, or of many the next in turn, as start-up takes 20 µs a vehicle."""
         first = self._tick_count * _IN_A_TICK % max(1, len(rows))
         return rows if len(rows) <= _IN_A_TICK else [*rows, *rows][first : first + _IN_A_TICK]
 

@@ -94,6 +94,16 @@ def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
     assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
 
 
+def test_a_heartbeat_of_zeros_is_not_taken_for_one_that_changes_nothing() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
+    station.step([peer.heartbeat(S, base_mode=129, custom_mode=4)], S)
+    station.step([peer.datagram(peer.link.command_ack_encode(511, 0), S + 10 * MS)], S + 20 * MS)
+    assert vehicle.armed
+    station.step([peer.datagram(peer.link.heartbeat_encode(0, 0, 0, 0, 0), S + 30 * MS)], S + 40 * MS)
+    assert (vehicle.armed, vehicle.custom_mode) == (False, 0)
+
+
 def test_reordered_or_repeated_frames_are_no_refusals_and_told_once() -> None:
     station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
     for second in range(1, 5):
