@@ -41,9 +41,10 @@ class LogSource:
 
 
 def found(run_or_file: Path) -> LogSource:
-    """The log, and the files beside it if it lies in a run's folder."""
+    """The log, and the files beside it if it lies in a run's folder and is that of all vehicles."""
     log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
-    if run_or_file.is_dir() and (others := sorted(run_or_file.glob(tlog_file("*")))):
+    others = sorted(log_file.parent.glob(tlog_file("*")))
+    if run_or_file.is_dir() and others:
         raise InputError(
             f"{run_or_file}: read a telemetry log for each network ({', '.join(file.name for file in others)}), wanted "
             "a run of network 0 alone, or one of its logs"
@@ -51,7 +52,7 @@ def found(run_or_file: Path) -> LogSource:
 
     def beside(name: str, read: Callable[[Path], _Found]) -> _Found | None:
         file = log_file.with_name(name)
-        return read(file) if log_file.name == TLOG_FILE and file.exists() else None
+        return read(file) if log_file.name == TLOG_FILE and not others and file.exists() else None
 
     scenario, design = beside(SCENARIO_FILE, files.load), beside(DESIGN_FILE, read_design)
     return LogSource(log_file, scenario, design, beside(SUMMARY_FILE, read_summary))

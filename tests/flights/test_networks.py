@@ -62,6 +62,8 @@ def test_vehicles_of_the_same_id_fly_in_networks_of_their_own(real_time: bool, t
     assert logs == {0: {1, 2}, 1: {1, 2}, 9: {2}}
     with pytest.raises(InputError, match=r"a telemetry log for each network \(flight-1\.tlog, flight-9\.tlog\)"):
         found(tmp_path / "run")
+    of_one = found(tmp_path / "run" / tlog_file(0))
+    assert of_one.scenario is None  # or the vehicles of other networks would count as lost
 
 
 def test_a_signed_flight_in_networks_is_the_unsigned_one() -> None:
