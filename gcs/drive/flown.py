@@ -20,10 +20,11 @@ from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import why_unknown
 from gcs.runs.files import RunTail, read_ticks, write_experiment
-from gcs.runs.grade import Truth, read_truth, truth_of
+from gcs.runs.grade import Truth, read_truth
 from gcs.runs.record import END, EVENTS_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
 from gcs.station.station import Station
 from scenarios.networks import networks_of
+from sim_vehicles.links.truth import MemoryRecorder
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7
 """Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
@@ -55,14 +56,14 @@ def fly_plan(
     """
     if real_time:
         return fly_real_time(plan, margins_of(plan), folder)
-    station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
+    station, recorder = Station(plan, start_ns=START_NS), MemoryRecorder() if with_truth else None
     writer = None
     if folder is not None:
         folder.mkdir(parents=True)
         write_experiment(folder, plan.scenario, margins_of(plan))
         writer = RunWriter(folder)
     rows: list[TickArray] = []
-    vehicles = vehicles_of(plan.scenario, record=records.append if with_truth else None)
+    vehicles = vehicles_of(plan.scenario, recorder=recorder)
     for tick in fly_lockstep(plan, station=station, vehicles=vehicles):
         rows.append(tick)
         if writer is not None:
@@ -70,10 +71,9 @@ def fly_plan(
             writer.frames(station.frames)
     events = [*station.events, Event(time_s=float(rows[-1]["time_s"][0]), kind=END, text=station.end_reason)]
     if writer is not None:
-        for event in events:
-            writer.event(event)
+        writer.event(*events)
         writer.close()
-    return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
+    return Flight(np.concatenate(rows), events, None if recorder is None else recorder.records)
 
 
 def identified_in_flight(plan: FlightPlan) -> FlightPlan:

@@ -15,6 +15,7 @@ from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
 from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
 from gcs.interrupts import held_back, stop_signals
+from gcs.link.datagram import Frames
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described, identified
@@ -117,9 +118,8 @@ def fly_in_virtual_time(
             for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
                 writer.tick(rows)
                 frames = sorted([*station.frames, *vehicles.take_sent()], key=itemgetter(1))
-                writer.frames(frames, EPOCH_NS)
-                for event in station.events:
-                    writer.event(event)
+                writer.frames(Frames(frames), EPOCH_NS)
+                writer.event(*station.events)
                 station.events.clear()
                 time_s = float(rows["time_s"][0])
                 if station.plan is not flown:

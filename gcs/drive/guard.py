@@ -32,7 +32,7 @@ class Guard:
 
     def received(
         self,
-        datagrams: list[Datagram],
+        datagrams: Iterable[Datagram],
         now_ns: int,
         refused: Counter[str],
         is_another: Callable[[int, Datagram], bool] | None = None,

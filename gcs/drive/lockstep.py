@@ -19,10 +19,10 @@ from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
 from gcs.link import datagram
-from gcs.link.datagram import Address, Arrivals, Block, Logged, Outbox
+from gcs.link.datagram import Address, Arrivals, Logged, Outbox
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
-from scenarios.kernel import Array, kernel
+from scenarios.kernel import Records
 from scenarios.keys.link import Links
 from scenarios.networks import network_of
 from scenarios.schema import Scenario
@@ -31,7 +31,7 @@ from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row, TruthLog
+from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Recorder, TruthLog
 
 START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start; not zero, so that a forgotten time is noticed."""
@@ -53,34 +53,37 @@ class Vehicles(Protocol):
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
-class LinkLosses:
+class LinkLosses(Recorder):
     """Counts the datagrams that entered the links and those lost, from the truth that `vehicles_of` records."""
 
     def __init__(self) -> None:
         self._entered: Counter[int] = Counter()
         self._lost: Counter[int] = Counter()
+        super().__init__(self._count)
 
-    def record(self, row: Row) -> None:
-        """Take a record of the truth."""
-        self._entered[row[0]] += 1
-        self._lost[row[0]] += row[0] in (LINK_UP, LINK_DOWN) and len(row) == 8 and row[6] & DROPPED != 0
+    def _count(self, records: Records) -> None:
+        for direction in (LINK_UP, LINK_DOWN):
+            own = records["kind"] == direction
+            self._entered[direction] += int(own.sum())
+            self._lost[direction] += int((own & (records["fate"] & DROPPED != 0)).sum())
 
     def share(self, direction: int) -> float:
         """Fraction of the datagrams that were lost up (LINK_UP, from vehicles) or down (LINK_DOWN)."""
+        self.flush()
         return self._lost[direction] / max(self._entered[direction], 1)
 
 
-def vehicles_of(scenario: Scenario, *, record: Record | None = None) -> Vehicles:
-    """The simulated vehicles of a scenario and their links, at the start; `record` is called with each truth record."""
-    return Fleet(scenario, START_NS, record=record)
+def vehicles_of(scenario: Scenario, *, recorder: Recorder | None = None) -> Vehicles:
+    """The simulated vehicles of a scenario and their links, at the start."""
+    return Fleet(scenario, START_NS, recorder=recorder)
 
 
 class RecordedVehicles:
     """The simulated vehicles of a plan, logged as in real time: their truth, and the frames sent to them."""
 
     def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
-        self._truth = TruthLog(truth_file)
-        self._vehicles = vehicles_of(plan.scenario, record=self._record)
+        self._log, self._truth = TruthLog(truth_file), Recorder(self._write)
+        self._vehicles = vehicles_of(plan.scenario, recorder=self._truth)
         self._sent: list[Logged] = []
 
     def step(self, received: Sent, now_ns: int) -> Sent:
@@ -93,12 +96,13 @@ class RecordedVehicles:
         return sent
 
     def close(self) -> None:
-        self._truth.close()
+        self._truth.flush()
+        self._log.close()
 
-    def _record(self, row: Row) -> None:
-        if row[0] == LINK_UP:  # logged as leaving when due, though it is computed later
-            row = (*row[:3], row[5], *row[4:])  # pyright: ignore[reportAssignmentType] - as long as it was
-        self._truth.record(row)
+    def _write(self, records: Records) -> None:
+        up = records["kind"] == LINK_UP
+        records["time_ns"][up] = records["due_ns"][up]  # logged as leaving when due, though it is computed later
+        self._log.write(records)
 
 
 def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
@@ -170,32 +174,9 @@ class _Bridge:
         return [datagram.Datagram(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
 
     def to_vehicles(self, outgoing: Outbox, now_ns: int) -> Datagrams:
-        table, streams = np.empty((4, len(outgoing)), np.int64), [np.empty(0, np.uint8)]
-        place = begin = 0
-        for part in outgoing.parts:
-            if isinstance(part, Block):
-                _enter(table, place, begin, part.frames.shape[1], part.sizes, part.rows, self._rows, now_ns)
-                place += len(part.rows)
-                streams.append(part.frames.ravel())
-            else:
-                data, address = part
-                table[:, place] = begin, begin + len(data), self._row[address], now_ns
-                place += 1
-                streams.append(np.frombuffer(data, np.uint8))
-            begin += len(streams[-1])
-        return Datagrams(np.concatenate(streams), table, self._ids)
-
-
-@kernel
-def _enter(
-    table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, rows_there: Array, now_ns: int
-) -> None:
-    """Enter frames of a width each, the first of which begins at `begin`, into the table of `Datagrams`."""
-    for k in range(len(rows)):
-        table[0, place + k] = begin + k * width
-        table[1, place + k] = begin + k * width + sizes[k]
-        table[2, place + k] = rows_there[rows[k]]
-        table[3, place + k] = now_ns
+        stream, table = outgoing.packed(self._row.__getitem__, lambda _: self._rows)
+        table[3] = now_ns
+        return Datagrams(stream, table, self._ids)
 
 
 def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:

@@ -11,28 +11,32 @@ import gc
 import os
 import select
 import socket
-import struct
 import time  # noqa: TID251 - this is a driver
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from typing import Self
+
+import numpy as np
 
 from gcs.control.phases import Phase
 from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
-from gcs.link.datagram import Datagram, Logged, Outgoing
+from gcs.link.datagram import Address, Arrivals, Datagram, Frames, Outbox, Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import MIRROR, RunWriter
 from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.station.station import Station
+from scenarios.networks import LAST_NETWORK
+from scenarios.sockets import Bytes, Ints, Reader, Writer, address_of, number_of, realtime_offset_ns, stamped
 
-_SO_TIMESTAMPNS = 35
-_TIMESPEC = struct.Struct("qq")
-_ANCILLARY_BYTES = 64
-_LARGEST_DATAGRAM = 2048
-_DATAGRAMS_A_STEP = 4096
+_MOST_ADDRESSES = 8192
+"""Most addresses that are remembered: anybody may send."""
+_NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
+"""Where the network is in an address's key, and the bits of `number_of`."""
 _TOGETHER_NS = 3_000_000
 """The station wakes for datagrams at most once in this time. Their stamps say when they arrived."""
 _BEFORE_TICK_NS = 2_000_000
@@ -46,16 +50,32 @@ def clock_ns() -> int:
     return time.monotonic_ns()
 
 
-def realtime_offset_ns() -> int:
-    """The offset from the station's clock to ns since 1970.
+@lru_cache(maxsize=_MOST_ADDRESSES)
+def _key(address: Address | None) -> int:
+    """An address and its network as one number; 0 for none."""
+    return 0 if address is None else address[2] << _NETWORK_BIT | number_of(address[:2])
 
-    Taken from the quickest of three readings of both clocks, as the process may be interrupted between them.
-    """
-    readings: list[tuple[int, int]] = []
-    for _ in range(3):
-        before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        readings.append((after_ns - before_ns, real_ns - (before_ns + after_ns) // 2))
-    return min(readings)[1]
+
+class _Addresses:
+    """The addresses that datagrams came from or went to lately, numbered in the order in which they were `known`."""
+
+    def __init__(self) -> None:
+        self.known: list[Address] = []
+        self._numbers: dict[int, int] = {}
+
+    def numbers(self, keys: Ints) -> Ints:
+        """The numbers of addresses, which may be new."""
+        if len(self.known) > _MOST_ADDRESSES:
+            self.known, self._numbers = [], {}
+        different, places = np.unique(keys, return_inverse=True)
+        return np.array([self._number(key) for key in different.tolist()], np.int64)[places]
+
+    def _number(self, key: int) -> int:
+        if key not in self._numbers:
+            self._numbers[key] = len(self.known)
+            network, number = divmod(key, 1 << _NETWORK_BIT)
+            self.known.append((*address_of(number), network))
+        return self._numbers[key]
 
 
 class StationSocket:
@@ -68,9 +88,17 @@ class StationSocket:
     def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
         self.guard, self.networks = guard, networks
         self._sockets = _bound(host, port, networks)
+        self._descriptors = np.zeros(LAST_NETWORK + 1, np.int64)
+        """By network."""
+        for network, own in self._sockets.items():
+            self._descriptors[network] = own.fileno()
+        self._networks = np.zeros(self._descriptors.max() + 1, np.int64)
+        """By descriptor."""
+        self._networks[self._descriptors[[*networks]]] = networks
+        self._reader, self._writer, self._addresses = Reader(), Writer(), _Addresses()
         self.bound_ns = self._woken_ns = clock_ns()
-        self._emptied_ns = dict.fromkeys(networks, self.bound_ns)
         self.send_errors = 0
+        self.send([])  # so that nothing is compiled in flight
 
     def __enter__(self) -> Self:
         return self
@@ -95,48 +123,35 @@ class StationSocket:
 
     def receive(
         self, refused: Counter[str] | None = None, is_another: Callable[[int, Datagram], bool] | None = None
-    ) -> list[Datagram]:
+    ) -> Arrivals | list[Datagram]:
         """All waiting datagrams, the oldest of each network first, with their arrival on the station's clock.
 
         `refused` and `is_another` are those of `Guard.received`.
         """
-        datagrams: list[Datagram] = []
-        for network in self._sockets:
-            self._receive(network, datagrams)
+        batch = self._reader.read(self._descriptors[[*self.networks]])
+        self.send_errors += batch.errors  # an earlier datagram met a closed port; the vehicle will count as silent
+        table = batch.table[:4]
+        table[2] = self._addresses.numbers(table[2] | self._networks[batch.table[4]] << _NETWORK_BIT)
+        arrivals = Arrivals(batch.stream, table, batch.read_ns - table[3], self._addresses.known)
         if self.guard is not None:
-            return self.guard.received(datagrams, clock_ns(), Counter() if refused is None else refused, is_another)
-        return datagrams
+            return self.guard.received(arrivals, clock_ns(), Counter() if refused is None else refused, is_another)
+        return arrivals
 
-    def send(self, outgoing: Iterable[Outgoing]) -> list[int]:
-        """Send datagrams; returns when each had been handed to the kernel, on the station's clock."""
-        sent_ns: list[int] = []
-        for data, (host, port, network) in outgoing if self.guard is None else self.guard.sent(outgoing, clock_ns()):
-            try:
-                self._sockets[network].sendto(data, (host, port))
-            except OSError:  # a full buffer or a closed port is a loss, which the link statistics show
-                self.send_errors += 1
-            sent_ns.append(clock_ns())
-        return sent_ns
+    def send(self, outgoing: Outbox | Sequence[Outgoing]) -> Arrivals:
+        """Send datagrams; returns them, before they were signed, with when each had been handed to the kernel."""
+        outbox = outgoing if isinstance(outgoing, Outbox) else Outbox(outgoing)
+        stream, table = _packed(outbox)
+        signed = (stream, table) if self.guard is None else _packed(Outbox(self.guard.sent(outbox, clock_ns())))
+        begins, ends, keys, _ = signed[1]
+        descriptors = self._descriptors[keys >> _NETWORK_BIT]
+        sent = self._writer.write(signed[0], begins, ends, descriptors, keys & _ADDRESS_BITS)
+        self.send_errors += sent.refused + sent.failed  # full buffers and closed ports are losses: links count them
+        table[2], table[3] = self._addresses.numbers(table[2]), sent.sent_ns
+        return Arrivals(stream, table, np.zeros(len(sent.sent_ns), np.int64), self._addresses.known)
 
-    def _receive(self, network: int, datagrams: list[Datagram]) -> None:
-        """Add the waiting datagrams of a network."""
-        own, oldest_ns = self._sockets[network], self._emptied_ns[network]
-        begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
-        for _ in range(_DATAGRAMS_A_STEP):
-            try:
-                data, ancillary, _, (host, port) = own.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
-            except BlockingIOError:
-                self._emptied_ns[network] = begin_ns
-                break
-            except ConnectionError:  # an earlier datagram met a closed port; the vehicle will count as silent
-                self.send_errors += 1
-                continue
-            seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
-            read_ns = clock_ns()
-            # Stamps jump when the wall clock is set, but nothing arrived before the socket was last empty.
-            received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
-            received_ns = min(max(received_ns, oldest_ns), read_ns)
-            datagrams.append(Datagram(data, (host, port, network), received_ns, read_ns - received_ns))
+
+def _packed(outbox: Outbox) -> tuple[Bytes, Ints]:
+    return outbox.packed(_key, lambda to: np.array([*map(_key, to)], np.int64))
 
 
 def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
@@ -155,13 +170,11 @@ def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket
         sockets: dict[int, socket.socket] = {}
         for network in networks:
             own = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+            stamped(own).setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             if port + network > _LAST_PORT:
                 raise OSError(errno.EADDRNOTAVAIL, f"there is no port {port + network} for network {network}")
             own.bind((host, port + network if port else 0))
             port = own.getsockname()[1] - network
-            own.setblocking(False)
             sockets[network] = own
         opened.pop_all()
     return sockets
@@ -206,7 +219,7 @@ def drive(
     to the vehicles.
     """
     plan = station.plan
-    log: list[Logged] = []
+    log = Frames()
     """Frames received and sent since the last tick, in order."""
     refusals = Refusals()
 
@@ -220,32 +233,24 @@ def drive(
         read_ns = station.next_tick_ns - _BEFORE_TICK_NS
         link.wait(min(station.next_event_ns, read_ns if clock_ns() < read_ns else station.next_tick_ns))
         now_ns = clock_ns()
-        requests: list[Outgoing] = []
+        requests = Outbox()
         if station.next_event_ns <= now_ns < station.next_tick_ns:
-            requests = [*station.step([], now_ns)[0]]  # before anything is read: a round trip counts from this step
-            link.send(requests)
-            log += [(data, now_ns, address) for data, address in requests]
+            requests = station.step([], now_ns)[0]  # before anything is read: a round trip counts from this step
+            log.add(_logged(link.send(requests), now_ns))
         datagrams = link.receive(station.counters, station.is_another)
         now_ns = clock_ns()
-        outbox, tick = station.step(datagrams, now_ns)
-        outgoing = [*outbox]
-        sent_ns = link.send(outgoing)
+        outgoing, tick = station.step(datagrams, now_ns)
+        sent = link.send(outgoing)
         if mirror is not None:
-            received = [frame for frame, _, _ in station.frames]
-            mirror.forward(received + [data for data, _ in requests + outgoing], now_ns)
+            mirror.forward([frame[0] for frames in (station.frames, requests, outgoing) for frame in frames], now_ns)
             link.send(mirror.passed_on(station.vehicles, now_ns))
-        log += station.frames
-        log += [
-            (data, own_ns if mavlink.is_set_point(data) else now_ns, address)
-            for (data, address), own_ns in zip(outgoing, sent_ns, strict=True)
-        ]
-        station.frames.clear()
+        log.take(station.frames)
+        log.add(_logged(sent, now_ns))
         if tick is None:
             continue
-        writer.tick(station.complete(tick, sent_ns))
+        writer.tick(station.complete(tick, sent.table[3]))
         writer.frames(log, realtime_offset_ns())
-        for event in station.events:
-            writer.event(event)
+        writer.event(*station.events)
         log.clear()
         station.events.clear()
         log_refusals(now_ns)
@@ -258,3 +263,10 @@ def drive(
     if mirror is not None:
         time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
         writer.event(Event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts))
+
+
+def _logged(sent: Arrivals, now_ns: int) -> Arrivals:
+    """Datagrams sent, as they are logged: set-points with when each was sent, others with the time of their step."""
+    table = sent.table.copy()
+    table[3] = np.where(mavlink.are_set_points(sent.stream, table[0]), table[3], now_ns)
+    return replace(sent, table=table)

@@ -4,12 +4,14 @@ Many are kept as one array of bytes and a table that says where each begins and 
 a datagram that somebody reads.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from scenarios.kernel import Array, kernel
+from scenarios.sockets import Bytes, Ints, joined
 
 Address = tuple[str, int, int]
 """Host and port, and the network: the number of the station's socket that this address sends to."""
@@ -32,16 +34,17 @@ Logged = tuple[bytes, int, Address]
 """A frame, when it was received or sent, and from or to whom."""
 
 
-class Arrivals(NamedTuple):
-    """Received datagrams.
+@dataclass(slots=True)
+class Arrivals:
+    """Datagrams received, or sent; whoever iterates over them gets objects.
 
-    The rows of `table` (4, n) say of each where it begins and ends in `stream`, which of `addresses` it is from, and
-    when it was received.
+    The rows of `table` (4, n) say of each where it begins and ends in `stream`, which of `addresses` it is from or to,
+    and when it was received or sent.
     """
 
-    stream: NDArray[np.uint8]
-    table: NDArray[np.int64]
-    queued_ns: NDArray[np.int64]
+    stream: Bytes
+    table: Ints
+    queued_ns: Ints
     addresses: Sequence[Address]
 
     def datagram(self, place: int) -> Datagram:
@@ -49,35 +52,45 @@ class Arrivals(NamedTuple):
         data = self.stream[begin:end].tobytes()
         return Datagram(data, self.addresses[sender], received_ns, self.queued_ns.item(place))
 
+    def __len__(self) -> int:
+        return self.table.shape[1]
+
+    def __iter__(self) -> Iterator[Datagram]:
+        return map(self.datagram, range(len(self)))
+
 
 def arrivals_of(datagrams: Sequence[Datagram]) -> Arrivals:
     """The same datagrams as arrays."""
     data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True) if datagrams else ((), (), (), ())
     senders = {address: place for place, address in enumerate(dict.fromkeys(addresses))}
-    ends = np.cumsum([0, *map(len, data)])
+    stream, ends = joined(data)
     table = np.array([ends[:-1], ends[1:], [senders[address] for address in addresses], received_ns], np.int64)
-    stream = np.frombuffer(bytearray().join(data), np.uint8)
     return Arrivals(stream, table.reshape(4, -1), np.array(queued_ns, np.int64), [*senders])
 
 
 class Frames:
-    """Frames received, in order, until they are cleared."""
+    """Frames received or sent, in order, until they are cleared."""
 
-    def __init__(self) -> None:
-        self._parts: list[Logged | Arrivals] = []
+    def __init__(self, frames: Iterable[Logged] = ()) -> None:
+        self.parts: list[Logged | Arrivals] = [*frames]
 
     def append(self, frame: Logged) -> None:
-        self._parts.append(frame)
+        self.parts.append(frame)
 
-    def add(self, arrivals: Arrivals, first: int, stop: int) -> None:
+    def add(self, arrivals: Arrivals, first: int = 0, stop: int | None = None) -> None:
         """Add the datagrams from the place `first` up to `stop`, each of one frame."""
-        self._parts.append(arrivals._replace(table=arrivals.table[:, first:stop]))
+        self.parts.append(replace(arrivals, table=arrivals.table[:, first:stop]))
+
+    def take(self, other: "Frames") -> None:
+        """Add all frames of another, which has none then."""
+        self.parts += other.parts
+        other.clear()
 
     def clear(self) -> None:
-        self._parts.clear()
+        self.parts.clear()
 
     def __iter__(self) -> Iterator[Logged]:
-        for part in self._parts:
+        for part in self.parts:
             if not isinstance(part, Arrivals):
                 yield part
                 continue
@@ -92,26 +105,45 @@ class Block:
     `to` holds the addresses of all vehicles.
     """
 
-    frames: NDArray[np.uint8]
-    sizes: NDArray[np.int64]
-    rows: NDArray[np.int64]
+    frames: Bytes
+    sizes: Ints
+    rows: Ints
     to: Sequence[Address | None]
 
 
 class Outbox:
     """Datagrams to be sent, in order. Iterating over it gives (bytes, address) of each."""
 
-    def __init__(self) -> None:
-        self.parts: list[Outgoing | Block] = []
-        self._count = 0
+    def __init__(self, parts: Iterable[Outgoing | Block] = ()) -> None:
+        self.parts: list[Outgoing | Block] = [*parts]
 
     def append(self, each: Outgoing) -> None:
         self.parts.append(each)
-        self._count += 1
 
     def add(self, block: Block) -> None:
         self.parts.append(block)
-        self._count += len(block.rows)
+
+    def packed(
+        self, number: Callable[[Address], int], numbers: Callable[[Sequence[Address | None]], Ints]
+    ) -> tuple[Bytes, Ints]:
+        """Its datagrams as the stream and the table of `Arrivals`, not yet sent: with 0 for the times.
+
+        `number` and `numbers` give the numbers of one address and of the addresses of all vehicles.
+        """
+        table, streams = np.zeros((4, len(self)), np.int64), [np.empty(0, np.uint8)]
+        place = begin = 0
+        for part in self.parts:
+            if isinstance(part, Block):
+                _enter(table, place, begin, part.frames.shape[1], part.sizes, part.rows, numbers(part.to))
+                place += len(part.rows)
+                streams.append(part.frames.ravel())
+            else:
+                data, address = part
+                table[:3, place] = begin, begin + len(data), number(address)
+                place += 1
+                streams.append(np.frombuffer(data, np.uint8))
+            begin += len(streams[-1])
+        return np.concatenate(streams), table
 
     def __iter__(self) -> Iterator[Outgoing]:
         for part in self.parts:
@@ -125,4 +157,13 @@ class Outbox:
                 yield data[k * width : k * width + size], address
 
     def __len__(self) -> int:
-        return self._count
+        return sum(len(part.rows) if isinstance(part, Block) else 1 for part in self.parts)
+
+
+@kernel
+def _enter(table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, numbers: Array) -> None:
+    """Enter frames of a width each, the first of which begins at `begin`, into a table of datagrams."""
+    for k in range(len(rows)):
+        table[0, place + k] = begin + k * width
+        table[1, place + k] = begin + k * width + sizes[k]
+        table[2, place + k] = numbers[rows[k]]

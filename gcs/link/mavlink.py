@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Array, Records, int64, kernel
 from scenarios.networks import system_id_of
+from scenarios.sockets import Bytes, Ints
 
 STATION_SYSTEM_ID = 255
 STATION_COMPONENT_ID = 190
@@ -46,7 +47,6 @@ _HEADER, _HEADER_1_BYTES = struct.Struct("<BBBBBBBHB"), 6
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _OVERHEAD, _OVERHEAD_1 = 12, 8
-_SET_POINT_ID = SET_POSITION_TARGET_LOCAL_NED.to_bytes(3, "little")
 
 
 class _Layout(NamedTuple):
@@ -254,9 +254,10 @@ def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
     return (-1, target_system, 1, name.encode())
 
 
-def is_set_point(frame: bytes) -> bool:
-    """Whether a frame of MAVLink 2 is a SET_POSITION_TARGET_LOCAL_NED."""
-    return frame[7:10] == _SET_POINT_ID
+def are_set_points(stream: Bytes, begins: Ints) -> NDArray[np.bool_]:
+    """Which frames of MAVLink 2, beginning at these places, are SET_POSITION_TARGET_LOCAL_NED."""
+    ids = stream[begins[:, None] + np.arange(7, 10)]
+    return (ids == (SET_POSITION_TARGET_LOCAL_NED, 0, 0)).all(axis=1)
 
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07

@@ -9,7 +9,6 @@ acts; both are found in the truth by the time_boot_ms of the messages.
 
 import itertools
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED
 Truth = NDArray[np.void]
 """Records as sim_vehicles.links.truth.DTYPE lays them out."""
 
-_RECORD = np.dtype([("kind", "u1"), ("system_id", "<u2"), ("key", "<u4"), ("time_ns", "<i8")])
 _TIMESYNC = 111
 
 
@@ -167,11 +165,6 @@ def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
     p50, p99 = np.percentile(error_s, [50, 99]).tolist()
     largest = float(error_s.max())
     return Graded(status="measured", samples=error_s.size, error_p50_s=p50, error_p99_s=p99, error_max_s=largest)
-
-
-def truth_of(records: Iterable[Sequence[int]]) -> Truth:
-    """Those records of simulated vehicles that say when states were sampled and set-points acted."""
-    return np.array([tuple(record[:4]) for record in records if record[0] in (SAMPLED, ACTED)], _RECORD)
 
 
 def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:

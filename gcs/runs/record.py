@@ -10,7 +10,7 @@ import json
 import os
 import struct
 from collections import defaultdict
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,9 @@ from typing import Any
 import numpy as np
 
 from gcs.control.tick import Event, TickArray
-from gcs.link.datagram import Logged
+from gcs.link.datagram import Arrivals, Frames
+from scenarios.kernel import Array, kernel
+from scenarios.sockets import Ints
 
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
@@ -78,23 +80,31 @@ class RunWriter:
         self._time_s = float(rows["time_s"][0])
         self._add(TICKS_FILE, rows.tobytes())
 
-    def event(self, event: Event) -> None:
-        """Log an event, and those before it that could not be written yet."""
-        if len(self._waiting) < _MOST_WAITING or event.kind == END:
-            self._waiting.append(replace(event, time_s=round(event.time_s, 6)))
-        with contextlib.suppress(OSError):
-            lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
+    def event(self, *events: Event) -> None:
+        """Log events, and those before them that could not be written yet."""
+        self._waiting += (replace(event, time_s=round(event.time_s, 6)) for event in events)
+        lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
+        try:
             self._logs[EVENTS_FILE].add("".join(lines).encode())
             self._waiting.clear()
+        except OSError:
+            self._waiting = [e for k, e in enumerate(self._waiting) if k < _MOST_WAITING or e.kind == END]
 
-    def frames(self, frames: Iterable[Logged], epoch_ns: int = 0) -> None:
+    def frames(self, frames: Frames, epoch_ns: int = 0) -> None:
         """Log frames in the .tlog layout: big-endian µs since 1970, then the frame.
 
         `epoch_ns` is the instant, in ns since 1970, from which their times count.
         """
         entries: dict[int, list[bytes]] = defaultdict(list)
-        for frame, time_ns, (_, _, network) in frames:
-            entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
+        for part in frames.parts:
+            if isinstance(part, Arrivals):
+                for network, table in _by_network(part).items():
+                    entry = np.empty(int((table[1] - table[0]).sum()) + _STAMP.size * table.shape[1], np.uint8)
+                    _fill(entry, part.stream, table, epoch_ns)
+                    entries[network].append(entry.tobytes())
+            else:
+                frame, time_ns, (_, _, network) = part
+                entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
         for network, parts in entries.items():
             self._add(tlog_file(network), b"".join(parts))
 
@@ -118,6 +128,27 @@ class RunWriter:
             self._logs[name].add(data)
         except OSError as error:
             self.ended(name, error)
+
+
+def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
+    """The tables of the datagrams of each network."""
+    numbers, places = np.unique(arrivals.table[2], return_inverse=True)
+    networks = np.array([arrivals.addresses[number][2] for number in numbers.tolist()], np.int64)[places]
+    return {network: arrivals.table[:, networks == network] for network in np.unique(networks).tolist()}
+
+
+@kernel
+def _fill(entries: Array, stream: Array, table: Array, epoch_ns: int) -> None:
+    """Fill an array of bytes with the entries of a telemetry log."""
+    at = 0
+    for k in range(table.shape[1]):
+        stamp_us = (epoch_ns + table[3, k]) // 1000
+        for byte in range(8):
+            entries[at + byte] = stamp_us >> 8 * (7 - byte) & 0xFF
+        at += 8
+        for place in range(table[0, k], table[1, k]):
+            entries[at] = stream[place]
+            at += 1
 
 
 def event_fields(event: Event) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
     if (unstable := unstable_loop(plan)) is not None:
         raise GainsError(unstable)
     losses = LinkLosses()
-    station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan.scenario, record=losses.record))
+    station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan.scenario, recorder=losses))
     ticks = np.concatenate(list(fly_lockstep(plan, vehicles=counted, station=station)))
     flown = ticks[ticks["time_s"] >= 0.0]
     commanded = flown[flown["commanded"]]

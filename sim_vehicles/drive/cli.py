@@ -108,7 +108,7 @@ def _fly(
     opened.callback(ports.sockets.close)
     prepare(scenario)
     start_ns = time.monotonic_ns()
-    fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
+    fleet = Fleet(scenario, start_ns, recorder=log, signed=signed)
     say = _Lines(start_ns)
     how = ", signed" if signed else ""
     if not signed:
@@ -153,7 +153,7 @@ def _links_only(
         raise _UsageError(text) from None
     opened.callback(peers.sockets.close)
     start_ns = time.monotonic_ns()
-    links = Relay(scenario, start_ns, record=log.record if log else None)
+    links = Relay(scenario, start_ns, recorder=log)
     say = _Lines(start_ns)
     ports = ", ".join(map(_shown, options.vehicle_port))
     say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")

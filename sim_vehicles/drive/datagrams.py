@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_vehicles.links.queue import Bytes
-from sim_vehicles.vehicles.plain import Ints
+from scenarios.sockets import Bytes, Ints, joined
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
@@ -35,7 +34,6 @@ class Datagrams:
 
 def datagrams_of(datagrams: Sequence[Datagram], rows: Mapping[int, int]) -> Datagrams:
     """The same datagrams as arrays; `rows` are those of the system ids."""
-    stream = np.frombuffer(bytearray().join([data for _, data, _ in datagrams]), np.uint8)
-    ends = np.cumsum([0, *(len(data) for _, data, _ in datagrams)])
+    stream, ends = joined([data for _, data, _ in datagrams])
     numbers = [ends[:-1], ends[1:], [rows[key] for key, _, _ in datagrams], [time_ns for _, _, time_ns in datagrams]]
     return Datagrams(stream, np.array(numbers, np.int64), [*rows])

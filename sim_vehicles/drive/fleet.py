@@ -18,10 +18,10 @@ from scenarios.kernel import Columns, Records
 from scenarios.keys.link import Links
 from scenarios.schema import NS_PER_S
 from scenarios.signing.link import SignedLink
+from scenarios.sockets import Bytes
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
-from sim_vehicles.links.queue import Bytes
-from sim_vehicles.links.truth import Record
+from sim_vehicles.links.truth import MemoryRecorder, Recorder, can_record
 from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.motion.sector import SectorBound
 from sim_vehicles.services.clock import NEVER_NS
@@ -74,16 +74,16 @@ class Fleet:
         scenario: schema.Scenario,
         start_ns: int,
         *,
-        record: Record | None = None,
+        recorder: Recorder | None = None,
         signed: Mapping[int, SignedLink] | None = None,
     ) -> None:
         self._refused: Counter[str] = Counter()
-        self._record = record
+        self._recorder = recorder
         self._start_ns = start_ns
         self._members: dict[int, _Member] = {}
         self._external: ExternallyFlown | None = None
         """The leader, until the flight begins, if somebody else flies it."""
-        self._links = LinkSet(scenario, start_ns, record=record)
+        self._links = LinkSet(scenario, start_ns, recorder=recorder)
         count = len(scenario.vehicles)
         self._vehicles = new_vehicles(count)
         self._columns = Columns(self._vehicles)
@@ -101,7 +101,7 @@ class Fleet:
         self._sector = None if disturbance is None or disturbance.sector is None else SectorBound(scenario)
         self._in_order = sensors or self._links.have_channels or self._sector is not None
         for row, own in enumerate(sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id)):
-            radio = Radio(scenario, own, start_ns, record, Place(self._vehicles, self._columns, row))
+            radio = Radio(scenario, own, start_ns, recorder, Place(self._vehicles, self._columns, row))
             craft: DoubleIntegrator | Copter | ExternallyFlown
             if scenario.dynamics == "autopilot":
                 craft = Copter(scenario, own, radio)
@@ -183,19 +183,24 @@ class Fleet:
             begin, end, row, time_ns = entering.table[:, entered].tolist()
             self._in_rows[row].down.send(entering.stream[begin:end].tobytes(), time_ns)
             entered, waiting, leaving = step_all(*self._arrays(), *edge, entered + 1, now_ns)
-        out: list[Datagram] = []
         if waiting:
-            out = self._run_waiting(waiting, now_ns)
-            leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
-        if not out and leaving < self._leaving.shape[1]:
-            return self._left(leaving)
-        while leaving:
+            self._run_waiting(waiting, now_ns)
+            leaving = self._leave(now_ns)
+        left = self._left(leaving)
+        if leaving < self._leaving.shape[1] and can_record(self._links.queues.truth_rows):
+            return left
+        out = [*left]
+        while leaving := self._leave(now_ns):
             out += self._left(leaving)
-            if leaving < self._leaving.shape[1]:
-                break
-            leaving = leave_all(*self._arrays()[:4], self._leaving, self._leaving_data, now_ns)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
+
+    def _leave(self, now_ns: int) -> int:
+        """Let datagrams leave; returns how many."""
+        if self._recorder is not None:
+            self._recorder.make_room()
+        vehicles, links, entries, frames, _, truth = self._arrays()
+        return leave_all(vehicles, links, entries, frames, truth, self._leaving, self._leaving_data, now_ns)
 
     def _left(self, count: int) -> Datagrams:
         """So many datagrams that the kernel let leave, in order of time and row."""
@@ -204,14 +209,13 @@ class Fleet:
         in_order = table.take(table[3].argsort(kind="stable"), axis=1)
         return Datagrams(self._leaving_data[:size].copy(), in_order, self.system_ids)
 
-    def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records]:
+    def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records, Records]:
         """What the kernels work on."""
         queues = self._links.queues
-        return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws
+        return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws, queues.truth_rows
 
-    def _run_waiting(self, count: int, now_ns: int) -> list[Datagram]:
-        """Bring the vehicles up to date that the kernel has left; returns what leaves if that is recorded."""
-        out: list[Datagram] = []
+    def _run_waiting(self, count: int, now_ns: int) -> None:
+        """Bring the vehicles up to date that the kernel has left."""
         for _, row in sorted(self._waiting[:count].tolist()):
             member = self._in_rows[row]
             if self._columns["plain"][row]:
@@ -219,12 +223,7 @@ class Fleet:
                 if run_at(*self._arrays(), row, now_ns):
                     continue
             self._catch_up(member, now_ns)
-            if self._record is not None:
-                for entry in member.up.due(now_ns):
-                    out.append((member.vehicle.system_id, entry[3], entry[0]))
-                    self._record(member.up.row(entry, now_ns))
             self._plan(member)
-        return out
 
     def _begin(self, data: bytes, time_ns: int) -> None:
         """Begin the flight of a leader flown by somebody else, at the station's first set-point."""
@@ -290,8 +289,8 @@ class Fleet:
         if member.down.next_due_ns <= now_ns:
             for entry in member.down.due(now_ns):
                 arrived.append((entry[3], entry[0]))
-                if self._record is not None:
-                    self._record(member.down.row(entry, entry[0]))
+                if self._recorder is not None:
+                    self._recorder.add(member.down.row(entry, entry[0]))
         if member.signed is not None:
             arrived = [(member.signed.verify(data, time_ns, self._refused), time_ns) for data, time_ns in arrived]
             arrived = [(data, time_ns) for data, time_ns in arrived if data]
@@ -310,9 +309,8 @@ class Fleet:
 def prepare(scenario: schema.Scenario) -> None:
     """Fly plain vehicles of a scenario for seconds, logged and not, so that nothing is compiled in real time."""
     plain = {"dynamics": "double_integrator", "links": Links()}
-    log = list[object]()
-    for record in (None, log.append):
-        fleet = Fleet(scenario.model_copy(update=plain), 0, record=record)
+    for recorder in (None, MemoryRecorder()):
+        fleet = Fleet(scenario.model_copy(update=plain), 0, recorder=recorder)
         for tenth, frames in enumerate(zip(*map(rehearsal, fleet.system_ids), strict=True)):
             now_ns = tenth * NS_PER_S // 10
             fleet.step([(key, data, now_ns) for key, data in zip(fleet.system_ids, frames, strict=True)], now_ns)

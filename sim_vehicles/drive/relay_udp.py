@@ -5,7 +5,8 @@ to that socket go through the down link to the address from which the vehicle la
 """
 
 from scenarios.schema import NS_PER_S
-from sim_vehicles.drive.udp import Received, Sockets
+from scenarios.sockets import Received
+from sim_vehicles.drive.udp import Sockets
 from sim_vehicles.links.relay import Passing, holds_key, sender
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.vehicles.shell import Change
@@ -60,12 +61,12 @@ class Peers:
 
     def send(self, passing: list[Passing]) -> None:
         """Send what has left the links."""
+        sent: list[tuple[bytes, int, int, tuple[str, int] | None]] = []
         for due_ns, kind, system_id, data in passing:
-            if kind == LINK_UP:
-                self.sockets.send(self._station_side[system_id], data, due_ns)
-            else:
-                descriptor, address = self._addresses[system_id]
-                self.sockets.send(descriptor, data, due_ns, address)
+            up = kind == LINK_UP
+            descriptor, address = (self._station_side[system_id], None) if up else self._addresses[system_id]
+            sent.append((data, descriptor, due_ns, address))
+        self.sockets.send_each(sent)
 
     def take_changes(self) -> list[Change]:
         """The vehicles found since the last call."""

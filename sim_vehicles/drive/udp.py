@@ -11,15 +11,16 @@ import os
 import resource
 import select
 import socket
-import struct
 import time  # noqa: TID251 - this is the real-time driver
 from collections import Counter
-from collections.abc import Callable, Generator
-from typing import NamedTuple
+from collections.abc import Callable, Generator, Sequence
+
+import numpy as np
 
 from scenarios.networks import network_of
 from scenarios.schema import NS_PER_S
-from sim_vehicles.drive.datagrams import Datagram, Datagrams
+from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, Writer, joined, number_of, stamped
+from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """How long before a due time the loop polls the clock instead of sleeping: with few vehicles, late wake-ups are most of
@@ -29,28 +30,14 @@ TOGETHER_NS = 1_000
 vehicles act and receive about 30,000 times a second."""
 LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
-DATAGRAM_BYTES = 2048
-READS_PER_WAKE = 1000
+READ_OF_EACH = 16
 """Most datagrams read from one socket before the vehicles act again, so that a flood cannot hold them up."""
 LATE_NS = 5_000_000
 """A datagram that leaves later than this is counted: the emulated link then differs from the scenario's."""
-CLOCK_GAP_NS = 3_000
-"""A reading of both clocks that took longer than this was interrupted, and is discarded."""
 
 _OTHER_FILES = 100
 """Files that are open beside the sockets, and room for more."""
-_SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _PR_SET_TIMERSLACK = 29
-_STAMP = struct.Struct("qq")
-
-
-class Received(NamedTuple):
-    """A datagram with its receiving socket, the instant at which it reached this host, and its sender."""
-
-    descriptor: int
-    data: bytes
-    time_ns: int
-    address: tuple[str, int]
 
 
 class Sockets:
@@ -63,19 +50,17 @@ class Sockets:
         """The largest lateness among those counted as `left_late`; a reader may reset it to 0."""
         self._epoll = select.epoll()
         self._sockets: dict[int, socket.socket] = {}
-        self._clocks = _Clocks()
-        self._emptied_ns = self._woken_ns = time.monotonic_ns()
+        self._reader, self._writer = Reader(READ_OF_EACH), Writer()
+        self._woken_ns = time.monotonic_ns()
 
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
         """Open a socket, bound or connected, and return its file descriptor; a connected one hears only its peer.
 
         Raises OSError if the address cannot be used.
         """
-        own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        own = stamped(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         number = own.fileno()
         self._sockets[number] = own
-        own.setblocking(False)
-        own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         if bind is not None:
             own.bind(bind)
         if connect is not None:
@@ -101,59 +86,36 @@ class Sockets:
             pass
         self._woken_ns = time.monotonic_ns()
 
-    def receive(self) -> list[Received]:
-        """Everything that has arrived, at most `READS_PER_WAKE` datagrams from each socket, in turn."""
-        begin_ns = time.monotonic_ns()
-        to_monotonic_ns = self._clocks.to_monotonic_ns()
-        received: list[Received] = []
-        for _ in range(READS_PER_WAKE):
-            ready = self._epoll.poll(0)
-            if not ready:
-                self._emptied_ns = begin_ns
-                break
-            for descriptor, _ in ready:
-                read = self._read(self._sockets[descriptor])
-                if read is None:
-                    continue
-                data, stamp_ns, address = read
-                # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
-                latest_ns = time.monotonic_ns()
-                time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
-                time_ns = min(max(time_ns, self._emptied_ns), latest_ns)
-                received.append(Received(descriptor, data, time_ns, address))
-        return received
+    def receive(self) -> Batch:
+        """What has arrived, at most `READ_OF_EACH` datagrams of each socket: the next wait ends at once for more."""
+        ready = self._epoll.poll(0, len(self._sockets))
+        batch = self._reader.read([number for number, _ in ready])
+        self.counters["receive_refused"] += batch.errors  # answers to what was sent while nobody listened
+        return batch
 
-    def send(self, descriptor: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
-        """Send to the address, or to the socket's peer; failures are counted."""
-        own = self._sockets[descriptor]
-        try:
-            if address is None:
-                own.send(data)
-            else:
-                own.sendto(data, address)
-        except ConnectionRefusedError:
-            self.counters["send_refused"] += 1
-        except OSError:
-            self.counters["send_failed"] += 1
-        late_ns = time.monotonic_ns() - due_ns
-        if late_ns > LATE_NS:
-            self.counters["left_late"] += 1
-            self.latest_ns = max(self.latest_ns, late_ns)
+    def send(self, stream: Bytes, table: Ints, addresses: Ints | None = None) -> None:
+        """Send datagrams to addresses with these numbers, or to the sockets' peers; failures are counted.
 
-    def _read(self, own: socket.socket) -> tuple[bytes, int | None, tuple[str, int]] | None:
-        """One datagram with its stamp and sender; None if there is none after all."""
-        try:
-            data, ancillary, _, address = own.recvmsg(DATAGRAM_BYTES, 64)
-        except BlockingIOError:
-            return None
-        except OSError:  # the ICMP answer to a datagram sent while nobody listened
-            self.counters["receive_refused"] += 1
-            return None
-        stamp_ns = None
-        if ancillary and len(ancillary[0][2]) == _STAMP.size:
-            seconds, nanoseconds = _STAMP.unpack(ancillary[0][2])
-            stamp_ns = seconds * NS_PER_S + nanoseconds
-        return data, stamp_ns, address
+        The rows of `table` (4, n) say of each where it begins and ends in `stream`, from which socket, and when it is
+        due.
+        """
+        begins, ends, descriptors, due_ns = table
+        to = np.full(len(due_ns), NO_ADDRESS) if addresses is None else addresses
+        sent = self._writer.write(stream, begins, ends, descriptors, to)
+        self.counters["send_refused"] += sent.refused
+        self.counters["send_failed"] += sent.failed
+        late_ns = sent.sent_ns - due_ns
+        self.counters["left_late"] += int((late_ns > LATE_NS).sum())
+        latest_ns = int(late_ns.max(initial=0))
+        if latest_ns > LATE_NS:
+            self.latest_ns = max(self.latest_ns, latest_ns)
+
+    def send_each(self, datagrams: Sequence[tuple[bytes, int, int, tuple[str, int] | None]]) -> None:
+        """As `send`, of each its bytes, socket, due time and address, or None for the socket's peer."""
+        data, descriptors, due_ns, addresses = zip(*datagrams, strict=True) if datagrams else ((), (), (), ())
+        stream, ends = joined(data)
+        to = [NO_ADDRESS if address is None else number_of(address) for address in addresses]
+        self.send(stream, np.array([ends[:-1], ends[1:], descriptors, due_ns], np.int64), np.array(to, np.int64))
 
 
 class Ports:
@@ -168,20 +130,31 @@ class Ports:
         try:
             _allow_open(len(system_ids) + _OTHER_FILES)
             host, port = station
-            self._descriptors = {key: self.sockets.add(connect=(host, port + network_of(key))) for key in system_ids}
+            opened = [self.sockets.add(connect=(host, port + network_of(key))) for key in system_ids]
         except OSError:
             self.sockets.close()
             raise
-        self._system_ids = {number: system_id for system_id, number in self._descriptors.items()}
+        self._system_ids = system_ids
+        self._numbers = np.array(opened, np.int64)
+        self._rows = np.zeros(self._numbers.max(initial=0) + 1, np.int64)
+        """The vehicles' rows by descriptor."""
+        self._rows[self._numbers] = range(len(system_ids))
+        self.send([])  # so that nothing is compiled in flight
+        self.receive()
 
-    def receive(self) -> list[Datagram]:
-        """Everything that has arrived, with the instants at which it reached this host."""
-        system_ids = self._system_ids
-        return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
+    def receive(self) -> Datagrams:
+        """What has arrived, with the instants at which it reached this host."""
+        batch = self.sockets.receive()
+        table = batch.table[:4]
+        table[2] = self._rows[batch.table[4]]
+        return Datagrams(batch.stream, table, self._system_ids)
 
     def send(self, datagrams: Datagrams | list[Datagram]) -> None:
-        for system_id, data, due_ns in datagrams:
-            self.sockets.send(self._descriptors[system_id], data, due_ns)
+        if not isinstance(datagrams, Datagrams):
+            datagrams = datagrams_of(datagrams, {system_id: row for row, system_id in enumerate(self._system_ids)})
+        table = datagrams.table.copy()
+        table[2] = self._numbers[table[2]]
+        self.sockets.send(datagrams.stream, table)
 
 
 def _allow_open(files: int) -> None:
@@ -190,24 +163,6 @@ def _allow_open(files: int) -> None:
     if soft < files and soft != resource.RLIM_INFINITY:
         most = files if hard == resource.RLIM_INFINITY else min(files, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-
-
-class _Clocks:
-    """The difference between the kernel's stamps (CLOCK_REALTIME) and CLOCK_MONOTONIC, followed continuously."""
-
-    def __init__(self) -> None:
-        self._offset_ns = time.monotonic_ns() - time.time_ns()
-        self._read_ns = 0
-
-    def to_monotonic_ns(self) -> int:
-        """What to add to a kernel stamp."""
-        before_ns = time.monotonic_ns()
-        real_ns = time.time_ns()
-        after_ns = time.monotonic_ns()
-        if after_ns - before_ns < CLOCK_GAP_NS or after_ns - self._read_ns > NS_PER_S:
-            self._offset_ns = (before_ns + after_ns) // 2 - real_ns
-            self._read_ns = after_ns
-        return self._offset_ns
 
 
 def run(

@@ -17,7 +17,7 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles.links import truth
 from sim_vehicles.links.fate import BLOCK, Stream, behaviour_of, constant, delay_at, flip, flips_of, in_outage
 from sim_vehicles.links.queue import NOT_READY, Queues, enter_at, has_room, new_queues, take_due_at
-from sim_vehicles.links.truth import DROPPED, DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
+from sim_vehicles.links.truth import DROPPED, DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Recorder, Row
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.draws import Use, seeds_of
 from sim_vehicles.services.frames import FRAME_BYTES
@@ -90,7 +90,7 @@ class Link:
     under_way = Cell[int]()
     """How many datagrams have neither come out nor been dropped."""
     plain = Cell[bool]()
-    """Whether kernels alone can run it: no channel limits it, it is the same at all times, and nothing is recorded."""
+    """Whether kernels alone can run it: no channel limits it, and it is the same at all times."""
     _drawn = Cell[int]()
     _barred = Cell[int]()
 
@@ -103,7 +103,6 @@ class Link:
         system_id: int = 0,
         kind: int = LINK_UP,
         channel: Channel | None = None,
-        record: Record | None = None,
         queues: Queues | None = None,
         row: int = 0,
     ) -> None:
@@ -114,7 +113,6 @@ class Link:
         self._behaviour = behaviour_of(link)
         self._capacity = capacity
         self._channel = channel
-        self._truth = record
         self._queues, self._row = new_queues(1) if queues is None else queues, row
         self._columns = self._queues.columns
         self._long: dict[tuple[int, int], bytes] = {}
@@ -125,7 +123,7 @@ class Link:
         own = self._behaviour
         self._delay_ns = own.points_ns[0][1]
         values = {"capacity": capacity, "random": self._stream is not None, "delay_ns": self._delay_ns}
-        values["plain"] = channel is None and not own.timed and record is None
+        values |= {"kind": kind, "system_id": system_id, "plain": channel is None and not own.timed}
         for name in (
             "least_delay_ns",
             "reordering",
@@ -165,15 +163,13 @@ class Link:
         entering = np.frombuffer(data, np.uint8), time_ns, begin_ns, end_ns, delay_ns
         queues, fate = self._queues, NOT_READY
         while fate == NOT_READY:
-            fate = enter_at(queues.links, queues.entries, queues.frames, queues.draws, self._row, *entering)
+            fate = enter_at(
+                queues.links, queues.entries, queues.frames, queues.draws, queues.truth_rows, self._row, *entering
+            )
             if fate == NOT_READY:
                 self.make_ready()
         if len(data) > FRAME_BYTES:
             self._keep(data, fate)
-        if self._truth is not None and fate & DROPPED:
-            fate &= DUPLICATE | DROPPED
-            row = (self.kind, self.system_id, message_id(data), time_ns, time_ns, time_ns, fate, begin_ns - time_ns)
-            self._truth(row)
 
     def due(self, now_ns: int) -> list[Entry]:
         """The datagrams that have come out by now, in order."""
@@ -194,12 +190,14 @@ class Link:
         return self.kind, self.system_id, message_id(data), time_ns, entered_ns, due_ns, fate, queued_ns
 
     def make_ready(self) -> None:
-        """See to it that a datagram can enter: that there are draws, and room in the pool for it and a duplicate."""
+        """See to it that a datagram and a duplicate can enter: that there are draws, and room for them and records."""
         if self._stream is not None and self._drawn == BLOCK:
             self._stream.fill(self._queues.draws[self._row])
             self._drawn = 0
         if not has_room(self._queues.entries):
             self._queues.grow()
+        if self._queues.recorder is not None:
+            self._queues.recorder.make_room()
 
     def _keep(self, data: bytes, fate: int) -> None:
         """Keep a datagram that is longer than a frame, with the fate that it had."""
@@ -223,14 +221,13 @@ def row_of(number: int, kind: int) -> int:
 class LinkSet:
     """The links of all vehicles of a scenario, with the channels they share and their common time."""
 
-    def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
+    def __init__(self, scenario: schema.Scenario, start_ns: int, *, recorder: Recorder | None = None) -> None:
         self._links = scenario.links
         self._seed = scenario.seed
-        self._record = record
         self._channels: dict[tuple[str, int, int], Channel] = {}
         self._known = {channel.name: channel for channel in scenario.links.channels}
         self._pairs: dict[int, tuple[Link, Link]] = {}
-        self.queues = new_queues(2 * max(MOST_IN_NETWORK, len(scenario.vehicles)))
+        self.queues = new_queues(2 * max(MOST_IN_NETWORK, len(scenario.vehicles)), recorder)
         """Of all links, in the rows of `row_of`."""
         self.zero_ns = start_ns if scenario.links.times_from == "start" else NEVER_NS
         """Host time at which the links' time is 0; NEVER_NS before the flight has begun."""
@@ -267,7 +264,7 @@ class LinkSet:
     def _made(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
-            record=self._record, queues=self.queues, row=row_of(len(self._pairs), kind),
+            queues=self.queues, row=row_of(len(self._pairs), kind),
         )  # fmt: skip
         made.zero_ns = self.zero_ns
         return made

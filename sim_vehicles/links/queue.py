@@ -7,16 +7,29 @@ those of one time in order of entry. Entry 0 is none; its `after` begins the lis
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scenarios.kernel import Columns, Record, Records, kernel
+from scenarios.sockets import Bytes
 from sim_vehicles.links.fate import BLOCK, DRAW, drawn_bad, flip, flips_of
-from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_FULL, LOST, OUTAGE, PASSED, QUEUE_FULL
+from sim_vehicles.links.truth import (
+    CORRUPTED,
+    DUPLICATE,
+    LINK_FULL,
+    LOST,
+    OUTAGE,
+    PASSED,
+    QUEUE_FULL,
+    Recorder,
+    can_record,
+    note,
+    rows_of,
+)
 from sim_vehicles.services.clock import NEVER_NS
-from sim_vehicles.services.frames import FRAME_BYTES
+from sim_vehicles.services.frames import FRAME_BYTES, first_message
 
 LINK = np.dtype(
     [
+        ("kind", "i8"), ("system_id", "i8"),  # LINK_UP or LINK_DOWN of this vehicle
         ("next_due_ns", "i8"), ("first", "i8"), ("last", "i8"),  # the list of its entries
         ("under_way", "i8"), ("capacity", "i8"),
         ("entered", "i8"),
@@ -46,8 +59,6 @@ ENTRY = np.dtype(
 """A datagram under way. A duplicate has the number of its original."""
 _FIRST_SIZE = 64
 
-Bytes = NDArray[np.uint8]
-
 
 @dataclass(slots=True)
 class Queues:
@@ -63,6 +74,12 @@ class Queues:
     """Of DRAW: the next draws of each link, (n, BLOCK)."""
     columns: Columns
     """Of `links`."""
+    recorder: Recorder | None = None
+    """Where what happens is recorded."""
+
+    @property
+    def truth_rows(self) -> Records:
+        return rows_of(self.recorder)
 
     def grow(self) -> None:
         """Double the pool."""
@@ -73,13 +90,13 @@ class Queues:
         _free_from(entries, size)
 
 
-def new_queues(count: int) -> Queues:
+def new_queues(count: int, recorder: Recorder | None = None) -> Queues:
     """The queues of so many links that nothing has entered."""
     links, entries = np.zeros(count, LINK), np.zeros(_FIRST_SIZE, ENTRY)
     links["next_due_ns"], links["drawn"] = NEVER_NS, BLOCK
     _free_from(entries, 1)
     frames, draws = np.zeros((_FIRST_SIZE, FRAME_BYTES), np.uint8), np.zeros((count, BLOCK), DRAW)
-    return Queues(links, entries, frames, draws, Columns(links))
+    return Queues(links, entries, frames, draws, Columns(links), recorder)
 
 
 def _free_from(entries: Records, first: int) -> None:
@@ -96,9 +113,9 @@ def has_room(entries: Records) -> bool:
 
 
 @kernel
-def ready(link: Record, entries: Records) -> bool:
-    """Whether one more datagram, and a duplicate of it, can enter: there are draws and free entries."""
-    return has_room(entries) and not (link.random and link.drawn == BLOCK)
+def ready(link: Record, entries: Records, truth: Records) -> bool:
+    """Whether one more datagram, and a duplicate of it, can enter: there are draws, free entries and free records."""
+    return has_room(entries) and can_record(truth) and not (link.random and link.drawn == BLOCK)
 
 
 @kernel
@@ -123,20 +140,21 @@ def free(entries: Records, entry: int) -> None:
 
 
 @kernel
-def enter(link: Record, entries: Records, frames: Bytes, draws: Records, entry: int, time_ns: int) -> int:
+def enter(
+    link: Record, entries: Records, frames: Bytes, draws: Records, truth: Records, entry: int, time_ns: int
+) -> int:
     """Let the datagram in a new entry enter a plain link; returns its fate."""
-    return enter_later(link, entries, frames, draws, entry, time_ns, time_ns, time_ns, link.delay_ns)
+    return enter_later(link, entries, frames, draws, truth, entry, time_ns, time_ns, time_ns, link.delay_ns)
 
 
 @kernel
 def enter_later(
-    link: Record, entries: Records, frames: Bytes, draws: Records, entry: int,
+    link: Record, entries: Records, frames: Bytes, draws: Records, truth: Records, entry: int,
     time_ns: int, begin_ns: int, end_ns: int, delay_ns: int,
 ) -> int:  # fmt: skip
     """Let a datagram enter whose sending begins and ends at these times, with this delay but for jitter.
 
-    Returns its fate; with DUPLICATE and
-    LINK_FULL together, only its duplicate was dropped.
+    Returns its fate; with DUPLICATE and LINK_FULL together, only its duplicate was dropped.
     """
     link.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
     datagram = entries[entry]
@@ -145,7 +163,7 @@ def enter_later(
     dropped = LINK_FULL if link.barred != OUTAGE and link.under_way >= link.capacity else link.barred
     if not link.random:
         if dropped != PASSED:
-            return _drop(link, entries, entry, dropped)
+            return _drop(link, entries, frames, truth, entry, dropped)
         _insert(link, entries, entry, end_ns + delay_ns)
         return PASSED
     draw = draws[link.drawn]
@@ -154,7 +172,7 @@ def enter_later(
     if dropped == PASSED and draw.loss < (link.loss_bad if link.bad else link.loss_good):
         dropped = LOST
     if dropped != PASSED:
-        return _drop(link, entries, entry, dropped)
+        return _drop(link, entries, frames, truth, entry, dropped)
     if draw.corrupt < link.corrupt:
         link.corrupted += 1
         datagram.fate = CORRUPTED
@@ -165,6 +183,7 @@ def enter_later(
         link.duplicated += 1
         if link.under_way >= link.capacity:
             link.link_full += 1
+            record_datagram(truth, link, datagram, frames[entry], time_ns, time_ns, DUPLICATE | LINK_FULL)
             return datagram.fate | DUPLICATE | LINK_FULL
         copy = new_entry(entries)
         second = entries[copy]
@@ -186,8 +205,10 @@ def _in_turn(link: Record, due_ns: int) -> int:
 
 
 @kernel
-def _drop(link: Record, entries: Records, entry: int, fate: int) -> int:
+def _drop(link: Record, entries: Records, frames: Bytes, truth: Records, entry: int, fate: int) -> int:
     free(entries, entry)
+    entered_ns = entries[entry].entered_ns
+    record_datagram(truth, link, entries[entry], frames[entry], entered_ns, entered_ns, fate)
     if fate == LOST:
         link.lost += 1
     elif fate == OUTAGE:
@@ -218,6 +239,16 @@ def _insert(link: Record, entries: Records, entry: int, due_ns: int) -> None:
 
 
 @kernel
+def record_datagram(
+    truth: Records, link: Record, datagram: Record, frame: Bytes, time_ns: int, due_ns: int, fate: int
+) -> None:
+    """Record in the truth that a datagram left a link at a time, or was dropped."""
+    if len(truth) > 1:
+        key, entered_ns = first_message(frame, datagram.size), datagram.entered_ns
+        note(truth, link.kind, link.system_id, key, time_ns, entered_ns, due_ns, fate, datagram.queued_ns)
+
+
+@kernel
 def take(link: Record, entries: Records) -> int:
     """Remove the first entry of a link and return it; it keeps its content until another one enters."""
     entry = link.first
@@ -237,8 +268,7 @@ def take_in(entries: Records, frames: Bytes, data: Bytes, begin: int, size: int)
     """A new entry with a part of these bytes."""
     entry = new_entry(entries)
     entries[entry].size = size
-    if size <= FRAME_BYTES:
-        copy_bytes(frames[entry], 0, data, begin, size)
+    copy_bytes(frames[entry], 0, data, begin, min(size, FRAME_BYTES))
     return entry
 
 
@@ -247,15 +277,15 @@ NOT_READY = -1
 
 @kernel
 def enter_at(
-    links: Records, entries: Records, frames: Bytes, draws: Records, row: int, data: Bytes,
+    links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records, row: int, data: Bytes,
     time_ns: int, begin_ns: int, end_ns: int, delay_ns: int,
 ) -> int:  # fmt: skip
-    """Let a datagram enter the link in a row, see `enter_later`; NOT_READY if that needs draws or free entries."""
-    if not ready(links[row], entries):
+    """Let a datagram enter the link in a row, see `enter_later`; NOT_READY if `ready` says so."""
+    if not ready(links[row], entries, truth):
         return NOT_READY
     entry = take_in(entries, frames, data, 0, len(data))
     return enter_later(
-        links[row], entries, frames, draws[row], entry, time_ns, begin_ns, end_ns, delay_ns
+        links[row], entries, frames, draws[row], truth, entry, time_ns, begin_ns, end_ns, delay_ns
     )  # fmt: skip
 
 

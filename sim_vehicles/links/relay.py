@@ -13,7 +13,7 @@ from typing import NamedTuple
 from scenarios import schema
 from scenarios.networks import MOST_IN_NETWORK
 from sim_vehicles.links.links import Link, LinkSet
-from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Record
+from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Recorder
 from sim_vehicles.services.clock import NEVER_NS
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
@@ -52,11 +52,11 @@ def holds_key(data: bytes) -> bool:
 class Relay:
     """The links of a scenario between a station and any vehicles; `next_event_ns` says when to call `step` next."""
 
-    def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
+    def __init__(self, scenario: schema.Scenario, start_ns: int, *, recorder: Recorder | None = None) -> None:
         self.last_heard_ns = start_ns
         """When the station was last heard; the start if never."""
-        self._record = record
-        self._links = LinkSet(scenario, start_ns, record=record)
+        self._recorder = recorder
+        self._links = LinkSet(scenario, start_ns, recorder=recorder)
         self._entering: list[Passing] = []
         """Datagrams received later than the last step's now: an earlier one may still be unread."""
         self._heap: list[tuple[int, int, int]] = []
@@ -100,8 +100,8 @@ class Relay:
                 continue
             for entry in link.due(now_ns):
                 out.append(Passing(entry[0], kind, system_id, entry[3]))
-                if self._record is not None:
-                    self._record(link.row(entry, now_ns))
+                if self._recorder is not None:
+                    self._recorder.add(link.row(entry, now_ns))
             if link.next_due_ns != NEVER_NS:
                 heapq.heappush(heap, (link.next_due_ns, kind, system_id))
         out.sort(key=itemgetter(0, 1, 2))

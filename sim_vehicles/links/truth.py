@@ -6,13 +6,14 @@ most. An incomplete record at the end is skipped when reading and overwritten wh
 
 import contextlib
 import os
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from scenarios.kernel import Records, kernel
 
 SAMPLED, ACTED, LINK_UP, LINK_DOWN = 1, 2, 3, 4
 PUSHED, CARRIED, POSITION_ERROR, VELOCITY_ERROR = 5, 6, 7, 8
@@ -61,27 +62,95 @@ FATES = {
 }
 
 _MAGIC, _OLDER_MAGIC = b"UAVTRUE3", b"UAVTRUE2"
-_PACK = struct.Struct("<BHIqqqBq").pack
-_BATCH = 1024
+_BATCH = 8192
+_OF_ONE_EVENT = 4
+"""At least as many records as one event of a vehicle or link makes."""
 _PARTS = 1e9
 
 
 Row = tuple[int, int, int, int, int, int] | tuple[int, int, int, int, int, int, int, int]
 """One record's values in the order of DTYPE; omitted, the last two are 0."""
-Record = Callable[[Row], None]
-"""Takes one record: `TruthLog.record`, or the `append` of a list."""
+NOT_RECORDED: Records = np.zeros(1, DTYPE)
+"""In place of `Recorder.rows` where nothing is recorded."""
 
 
-class TruthLog:
-    """A truth log open for writing, a new one or one to continue; pass its `record` to a Fleet.
+class Recorder:
+    """The records of one simulation, from kernels and one by one, handed on in batches.
+
+    Kernels add theirs to `rows`. Row 0 is no record; its `queued_ns` counts the records after it.
+    """
+
+    def __init__(self, write: Callable[[Records], object], batch: int = _BATCH) -> None:
+        self.rows: Records = np.zeros(1 + batch, DTYPE)
+        self._counts = memoryview(self.rows["queued_ns"])
+        self._write = write
+
+    def add(self, row: Row) -> None:
+        """Add one record."""
+        self.make_room()
+        self._counts[0] = count = self._counts[0] + 1
+        self.rows[count] = row if len(row) == 8 else (*row, PASSED, 0)
+
+    def make_room(self) -> None:
+        """See to it that one event can be recorded."""
+        if not can_record(self.rows):
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand on the batch."""
+        count = self._counts[0]
+        self._write(self.rows[1 : 1 + count].copy())
+        self._counts[0] = 0
+
+
+def rows_of(recorder: Recorder | None) -> Records:
+    """The rows to which kernels add records."""
+    return NOT_RECORDED if recorder is None else recorder.rows
+
+
+class MemoryRecorder(Recorder):
+    """Keeps all records."""
+
+    def __init__(self, batch: int = _BATCH) -> None:
+        self._batches: list[Records] = [NOT_RECORDED[:0]]
+        super().__init__(self._batches.append, batch)
+
+    @property
+    def records(self) -> Records:
+        """The records so far."""
+        self.flush()
+        return np.concatenate(self._batches)
+
+
+@kernel
+def can_record(rows: Records) -> bool:
+    """Whether one event can be recorded, or nothing is recorded."""
+    return len(rows) == 1 or rows[0].queued_ns + _OF_ONE_EVENT < len(rows)
+
+
+@kernel
+def note(
+    rows: Records, kind: int, system_id: int, key: int, time_ns: int,
+    entered_ns: int, due_ns: int, fate: int, queued_ns: int,
+) -> None:  # fmt: skip
+    """Add a record, see DTYPE, if there is room."""
+    if rows[0].queued_ns + 1 < len(rows):
+        rows[0].queued_ns += 1
+        row = rows[rows[0].queued_ns]
+        row.kind, row.system_id, row.key, row.fate, row.queued_ns = kind, system_id, key, fate, queued_ns
+        row.time_ns, row.entered_ns, row.due_ns = time_ns, entered_ns, due_ns
+
+
+class TruthLog(Recorder):
+    """A truth log open for writing, a new one or one to continue.
 
     Raises ValueError if the file is of another kind, and OSError if it cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__(self.write)
         self.lost = 0
         """Records that could not be written: a full disk stops no vehicle."""
-        self._batch: list[bytes] = []
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         head = os.pread(self._file, len(_MAGIC), 0)
         if not _MAGIC.startswith(head):
@@ -92,25 +161,17 @@ class TruthLog:
         """Where the next batch goes: after the last complete record, over whatever a failed write left there."""
         self.flush()
 
-    def record(self, row: Row) -> None:
-        """Add a record to the batch, and write the batch if it is full."""
-        self._batch.append(_PACK(*row) if len(row) == 8 else _PACK(*row, PASSED, 0))
-        if len(self._batch) >= _BATCH:
-            self.flush()
-
-    def flush(self) -> None:
-        """Hand the batch to the operating system."""
+    def write(self, records: Records) -> None:
+        """Hand records to the operating system."""
         head = b"" if self._end else _MAGIC
-        data = head + b"".join(self._batch)
         try:
-            written = os.pwrite(self._file, data, self._end)
+            written = os.pwrite(self._file, head + records.tobytes(), self._end)
         except OSError:
             written = 0
         whole = max(0, written - len(head)) // DTYPE.itemsize
         if written >= len(head):
             self._end += len(head) + whole * DTYPE.itemsize
-        self.lost += len(self._batch) - whole
-        self._batch.clear()
+        self.lost += len(records) - whole
 
     def close(self) -> None:
         """Write the last batch and cut off an incomplete record."""

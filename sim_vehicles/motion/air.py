@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 from scenarios.keys import disturbance
 from scenarios.keys.own import BUILT_IN
 from scenarios.schema import NS_PER_S, Scenario
-from sim_vehicles.links.truth import CARRIED, PUSHED, Record, disturbance_row
+from sim_vehicles.links.truth import CARRIED, PUSHED, Recorder, disturbance_row
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.draws import Use, draws_of
 
@@ -71,12 +71,12 @@ class Gusts:
 class Air:
     """All that pushes one vehicle. `add` sets what the fleet adds from now on."""
 
-    def __init__(self, scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> None:
+    def __init__(self, scenario: Scenario, system_id: int, start_ns: int, recorder: Recorder | None) -> None:
         found = scenario.disturbance or disturbance.Disturbance()
         self._wind = found.wind_ne_m_s2
         self._gusts = None if found.gusts is None else Gusts(found.gusts, scenario.seed, system_id)
         self._added = STILL
-        self._system_id, self._start_ns, self._record = system_id, start_ns, record
+        self._system_id, self._start_ns, self._recorder = system_id, start_ns, recorder
         self._recorded: Push | None = None
 
     def add(self, push: Push) -> None:
@@ -129,16 +129,16 @@ class Air:
     def _note(self, push: Push, time_ns: int) -> None:
         if self._gusts is not None:
             self._gusts.forget((time_ns - self._start_ns) // STEP_NS)
-        if self._record is None or push == self._recorded:
+        if self._recorder is None or push == self._recorded:
             return
         before, self._recorded = self._recorded or STILL, push
         if push[:2] != before[:2]:
-            self._record(disturbance_row(PUSHED, self._system_id, 0, time_ns, push[0], push[1]))
+            self._recorder.add(disturbance_row(PUSHED, self._system_id, 0, time_ns, push[0], push[1]))
         if push[2:] != before[2:]:
-            self._record(disturbance_row(CARRIED, self._system_id, 0, time_ns, push[2], push[3]))
+            self._recorder.add(disturbance_row(CARRIED, self._system_id, 0, time_ns, push[2], push[3]))
 
 
-def air_of(scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> Air | None:
+def air_of(scenario: Scenario, system_id: int, start_ns: int, recorder: Recorder | None) -> Air | None:
     """What pushes a vehicle; None in still air, unless the scenario names the user's own dynamics."""
     still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
-    return None if still else Air(scenario, system_id, start_ns, record)
+    return None if still else Air(scenario, system_id, start_ns, recorder)

@@ -19,6 +19,7 @@ FRAME_BYTES = 280
 PAYLOAD = 10
 """Where a frame's payload begins."""
 NONE = -1
+NO_MESSAGE = 0xFFFFFF
 UINT32 = 0xFFFFFFFF
 AUTOPILOT, STATION_TYPE, LOCAL_NED, ARDUPILOT = 1, 6, 1, 3
 """MAV_COMP_ID_AUTOPILOT1, MAV_TYPE_GCS, MAV_FRAME_LOCAL_NED, MAV_AUTOPILOT_ARDUPILOTMEGA."""
@@ -66,6 +67,14 @@ def frequent_message(frame: Frame, size: int) -> int:
 
 
 @kernel
+def first_message(data: Frame, size: int) -> int:
+    """The message id of a datagram's first frame; NO_MESSAGE if it has none."""
+    if size < PAYLOAD or data[0] != _MAGIC:
+        return NO_MESSAGE
+    return int(data[7]) | int(data[8]) << 8 | int(data[9]) << 16
+
+
+@kernel
 def read_uint16(frame: Frame, at: int) -> int:
     return int(frame[at]) | int(frame[at + 1]) << 8
 
@@ -107,7 +116,7 @@ def finish(frame: Frame, vehicle: Record, extra: int) -> int:
         size -= 1
     end = PAYLOAD + size
     frame[0], frame[1], frame[2], frame[3] = _MAGIC, size, 0, 0
-    frame[4], frame[5], frame[6] = vehicle.sequence, vehicle.system_id, AUTOPILOT
+    frame[4], frame[5], frame[6] = vehicle.sequence, vehicle.wire_id, AUTOPILOT
     frame[8], frame[9] = 0, 0
     vehicle.sequence = (vehicle.sequence + 1) & 0xFF
     crc = checksum(frame, end, extra)

@@ -13,7 +13,7 @@ NOBODY = -1
 
 VEHICLE = np.dtype(
     [
-        ("system_id", "i8"),
+        ("system_id", "i8"), ("wire_id", "i8"),
         ("plain", "?"),  # whether kernels may run its usual events: `sim_vehicles.vehicles.plain`
         ("pushed", "?"),  # whether wind pushes it, too, so that the craft moves it before the kernels' events
         ("acts_ns", "i8"),  # when it next acts if nothing arrives

@@ -18,6 +18,7 @@ from scenarios.networks import wire_id
 from sim_vehicles.services.frames import (
     ARDUPILOT,
     FRAME_BYTES,
+    NO_MESSAGE,
     PAYLOAD,
     Frame,
     finish,
@@ -170,8 +171,8 @@ def in_version_1(frame: bytes) -> bytes:
 
 
 def message_id(data: bytes) -> int:
-    """Message id of a datagram's first frame, 0xFFFFFF if it has none."""
-    return int.from_bytes(data[7:10], "little") if len(data) >= HEADER_BYTES and data[0] == MAGIC_2 else 0xFFFFFF
+    """Message id of a datagram's first frame, NO_MESSAGE if it has none."""
+    return int.from_bytes(data[7:10], "little") if len(data) >= HEADER_BYTES and data[0] == MAGIC_2 else NO_MESSAGE
 
 
 def _refusal(data: bytes, begin: int, checked: int) -> str:
@@ -266,8 +267,8 @@ class Encoder:
 
     def __init__(self, place: Place) -> None:
         self._vehicles, self._columns, self._row = place
-        self.system_id: int = self._columns["system_id"][self._row]
-        self._pymavlink = dialect.MAVLink(None, srcSystem=self.system_id, srcComponent=COMPONENT_AUTOPILOT)
+        self.wire_id: int = self._columns["wire_id"][self._row]
+        self._pymavlink = dialect.MAVLink(None, srcSystem=self.wire_id, srcComponent=COMPONENT_AUTOPILOT)
         self._frame = np.zeros(FRAME_BYTES, np.uint8)
 
     def local_position(self, time_boot_ms: int, position: Triple, velocity: Triple) -> bytes:

@@ -150,7 +150,7 @@ class Services:
             if not self._schedule.interval_us(message_id):
                 self._set(message_id, interval_us, time_ns)
         bytewise = self.parameters.bytewise
-        uid = self._encoder.system_id
+        uid = self._encoder.wire_id
         return ACCEPTED, [messages.autopilot_version(self._version, uid, parameters_bytewise=bytewise)]
 
     def _interval(self, message_id: int | None) -> tuple[int, list[Message]]:

@@ -75,8 +75,8 @@ class Copter:
         """Origin of its local frame, in the scenario's frame."""
         self._radio = radio
         still, exact = scenario.disturbance is None, scenario.navigation is None
-        self._air = None if still else Air(scenario, own.system_id, start_ns, radio.record)
-        self._navigator = None if exact else Navigator(scenario, own.system_id, radio.record)
+        self._air = None if still else Air(scenario, own.system_id, start_ns, radio.recorder)
+        self._navigator = None if exact else Navigator(scenario, own.system_id, radio.recorder)
         self._target = Target()
         self._takeoff_m: float | None = None
         self._motion_ns = start_ns

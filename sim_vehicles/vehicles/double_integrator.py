@@ -137,14 +137,14 @@ class DoubleIntegrator:
         self._altitude_m = scenario.altitude_of(own)
         self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
-        self._air = air_of(scenario, own.system_id, radio.start_ns, radio.record)
+        self._air = air_of(scenario, own.system_id, radio.start_ns, radio.recorder)
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
         self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
         """Dynamics in place of the double integrator's; `_air` is then set, too."""
         self._hold = Hold() if scenario.control.execute_at and own.system_id != scenario.external_id else None
         if self._hold is not None:
             self.intervals_us = {**self.intervals_us, messages.NAMED_INT: LAG_INTERVAL_US}
-        self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
+        self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.recorder)
         if onboard is not None:
             radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
         self.is_plain = all(part is None for part in (self._own, self._hold, self._navigator, onboard))

@@ -7,13 +7,11 @@ before one that is not usual.
 
 from math import cos, pi, sin
 
-import numpy as np
-from numpy.typing import NDArray
-
 from scenarios.kernel import Record, Records, kernel
+from scenarios.sockets import Bytes, Ints
 from sim_vehicles.links.links import row_of
-from sim_vehicles.links.queue import Bytes, copy_bytes, enter, free, new_entry, ready, take, take_in
-from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
+from sim_vehicles.links.queue import copy_bytes, enter, free, new_entry, ready, record_datagram, take, take_in
+from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, PASSED, SAMPLED, can_record, note
 from sim_vehicles.motion.double_integrator import Command, advance_to, set_command
 from sim_vehicles.services.clock import NEVER_NS, boot_ns
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M, degrees
@@ -29,6 +27,7 @@ from sim_vehicles.services.frames import (
     SETPOINT,
     STATION_TYPE,
     TIMESYNC,
+    UINT32,
     Frame,
     frequent_message,
     global_position,
@@ -45,8 +44,6 @@ from sim_vehicles.services.schedule import schedule_report
 from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, takes_setpoints
 from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
 
-Ints = NDArray[np.int64]
-
 UNUSUAL, MOVE_FIRST, SILENT = -2, -1, 0
 """In place of the size of a frame to send: nothing has happened, as the event is unusual or the craft must move first;
 or it has happened, and there is no frame."""
@@ -61,25 +58,25 @@ def _must_move(vehicle: Record, time_ns: int) -> bool:
 
 
 @kernel
-def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame) -> int:
+def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame, truth: Records) -> int:
     """Act on a datagram that arrives; returns the size of the answer, SILENT, UNUSUAL or MOVE_FIRST."""
     number = frequent_message(frame, size)
     if number == SETPOINT:
-        return _take_setpoint(vehicle, frame, time_ns)
+        return _take_setpoint(vehicle, frame, time_ns, truth)
     if number == HEARTBEAT:
         return _take_heartbeat(vehicle, frame, time_ns)
     return _answer(vehicle, frame, time_ns, answer) if number == TIMESYNC else UNUSUAL
 
 
 @kernel
-def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int) -> int:
+def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) -> int:
     """Fly an acceleration that the station commands in flight."""
     if frame[1] != _SETPOINT_BYTES or frame[5] != vehicle.station or not takes_setpoints(vehicle):
         return UNUSUAL
     mask, component = read_uint16(frame, PAYLOAD + 48), frame[PAYLOAD + 51]
     if mask & (AXES | FORCE_SET) != ACCELERATION or frame[PAYLOAD + 52] != LOCAL_NED:
         return UNUSUAL
-    if frame[PAYLOAD + 50] != vehicle.system_id or component not in (0, AUTOPILOT):
+    if frame[PAYLOAD + 50] != vehicle.wire_id or component not in (0, AUTOPILOT):
         return UNUSUAL
     north, east, down = (
         read_float(frame, PAYLOAD + 28),
@@ -96,6 +93,8 @@ def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int) -> int:
     advance_to(vehicle, acts_ns)
     set_command(vehicle, Command(north, east, 0.0, 0.0, 0.0))
     vehicle.setpoints += 1
+    key = read_int64(frame, PAYLOAD, 4)  # its sender's time_boot_ms
+    note(truth, ACTED, vehicle.system_id, key, acts_ns, acts_ns, acts_ns, PASSED, 0)
     return SILENT
 
 
@@ -114,7 +113,7 @@ def _answer(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
     """Answer a TIMESYNC request to this vehicle or to all."""
     size = int(frame[1])
     target = frame[PAYLOAD + 16] if size > 16 else 0
-    if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0 or target not in (0, vehicle.system_id):
+    if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0 or target not in (0, vehicle.wire_id):
         return UNUSUAL
     ts1 = read_int64(frame, PAYLOAD + 8, min(max(size - 8, 0), 8))
     tc1 = boot_ns(vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb, time_ns)
@@ -123,7 +122,7 @@ def _answer(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
 
 
 @kernel
-def report(vehicle: Record, frame: Frame) -> int:
+def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     """Make the report that is due, before any other event, and schedule the next; returns as `hear`."""
     k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
     if REPORTS[k] != HEARTBEAT:
@@ -139,6 +138,7 @@ def report(vehicle: Record, frame: Frame) -> int:
         return heartbeat(frame, vehicle, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
     v_north, v_east = vehicle.speed_m_s * cos(yaw), vehicle.speed_m_s * sin(yaw)
     if REPORTS[k] == LOCAL_POSITION:
+        note(truth, SAMPLED, vehicle.system_id, boot_ms & UINT32, time_ns, time_ns, time_ns, PASSED, 0)
         return local_position(frame, vehicle, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
     latitude_deg, longitude_deg = degrees(north, east)
     altitude_m = ORIGIN_ALTITUDE_M + vehicle.altitude_m
@@ -146,23 +146,26 @@ def report(vehicle: Record, frame: Frame) -> int:
 
 
 @kernel
-def hear_at(vehicles: Records, row: int, data: Bytes, time_ns: int, frames: Bytes) -> int:
-    """As `hear`; `frames` has room for the datagram and for the answer."""
+def hear_at(vehicles: Records, row: int, data: Bytes, time_ns: int, frames: Bytes, truth: Records) -> int:
+    """As `hear`; `frames` has room for the datagram and for the answer. UNUSUAL if `truth` has no room."""
+    if not can_record(truth):
+        return UNUSUAL
     copy_bytes(frames[0], 0, data, 0, len(data))
-    return hear(vehicles[row], frames[0], len(data), time_ns, frames[1])
+    return hear(vehicles[row], frames[0], len(data), time_ns, frames[1], truth)
 
 
 @kernel
-def report_at(vehicles: Records, row: int, frames: Bytes) -> int:
-    """As `report`, into the second of `frames`; also UNUSUAL if another message is due by then."""
+def report_at(vehicles: Records, row: int, frames: Bytes, truth: Records) -> int:
+    """As `report`, into the second of `frames`; UNUSUAL if another message is due by then, or `truth` has no room."""
     vehicle = vehicles[row]
-    return report(vehicle, frames[1]) if vehicle.report_ns < vehicle.other_ns else UNUSUAL
+    return report(vehicle, frames[1], truth) if can_record(truth) and vehicle.report_ns < vehicle.other_ns else UNUSUAL
 
 
 @kernel
 def run(
-    vehicle: Record, up: Record, down: Record, entries: Records, frames: Bytes, draws: Records, now_ns: int
-) -> bool:
+    vehicle: Record, up: Record, down: Record, entries: Records, frames: Bytes, draws: Records, truth: Records,
+    now_ns: int,
+) -> bool:  # fmt: skip
     """Run a plain vehicle until now; False if it stops before an unusual event. `draws` are those of its up link."""
     while True:
         acts_ns = min(vehicle.deadline_ns, vehicle.report_ns, vehicle.other_ns)
@@ -170,18 +173,20 @@ def run(
         time_ns = min(acts_ns, down.next_due_ns)
         if time_ns > now_ns:
             return True
-        if not ready(up, entries):
+        if not ready(up, entries, truth):
             return False
         entry, size = new_entry(entries), UNUSUAL
         if down.next_due_ns == time_ns:
-            size = hear(vehicle, frames[down.first], entries[down.first].size, time_ns, frames[entry])
+            arrived = entries[down.first]
+            size = hear(vehicle, frames[down.first], arrived.size, time_ns, frames[entry], truth)
             if size >= SILENT:
+                record_datagram(truth, down, arrived, frames[down.first], time_ns, time_ns, arrived.fate)
                 take(down, entries)
         elif vehicle.report_ns < min(vehicle.deadline_ns, vehicle.other_ns):
-            size = report(vehicle, frames[entry])
+            size = report(vehicle, frames[entry], truth)
         if size > SILENT:
             entries[entry].size = size
-            enter(up, entries, frames, draws, entry, time_ns)
+            enter(up, entries, frames, draws, truth, entry, time_ns)
         else:
             free(entries, entry)
         if size < SILENT:
@@ -199,8 +204,9 @@ def leaves_ns(vehicle: Record, up: Record, down: Record) -> int:
 
 @kernel
 def _enter_all(
-    links: Records, entries: Records, frames: Bytes, draws: Records, data: Bytes, received: Ints, first: int
-) -> int:
+    links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
+    data: Bytes, received: Ints, first: int,
+) -> int:  # fmt: skip
     """Let datagrams enter their down links, from the first one on; returns the first that cannot, or their number.
 
     The rows of `received` say of each where it begins and ends in `data`, the vehicle's row, and its time.
@@ -208,25 +214,28 @@ def _enter_all(
     for k in range(first, received.shape[1]):
         begin, size, row = received[0, k], received[1, k] - received[0, k], row_of(received[2, k], LINK_DOWN)
         link = links[row]
-        if not link.plain or size > FRAME_BYTES or not ready(link, entries):
+        if not link.plain or size > FRAME_BYTES or not ready(link, entries, truth):
             return k
-        enter(link, entries, frames, draws[row], take_in(entries, frames, data, begin, size), received[3, k])
+        entry = take_in(entries, frames, data, begin, size)
+        enter(link, entries, frames, draws[row], truth, entry, received[3, k])
     return received.shape[1]
 
 
 @kernel
 def run_at(
-    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, row: int, now_ns: int
-) -> bool:
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
+    row: int, now_ns: int,
+) -> bool:  # fmt: skip
     """Run the plain vehicle in a row until now; False if it stops before an unusual event."""
     up, down = row_of(row, LINK_UP), row_of(row, LINK_DOWN)
-    return run(vehicles[row], links[up], links[down], entries, frames, draws[up], now_ns)
+    return run(vehicles[row], links[up], links[down], entries, frames, draws[up], truth, now_ns)
 
 
 @kernel
 def _run_all(
-    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, waiting: Ints, now_ns: int
-) -> int:
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
+    waiting: Ints, now_ns: int,
+) -> int:  # fmt: skip
     """Run the plain vehicles of which a datagram can leave by now until now.
 
     Returns how many others wait; these are in `waiting`, as (when their next datagram can leave, row).
@@ -237,7 +246,7 @@ def _run_all(
         first_ns = leaves_ns(vehicle, links[row_of(row, LINK_UP)], links[row_of(row, LINK_DOWN)])
         if first_ns > now_ns:
             continue
-        if not vehicle.plain or not run_at(vehicles, links, entries, frames, draws, row, now_ns):
+        if not vehicle.plain or not run_at(vehicles, links, entries, frames, draws, truth, row, now_ns):
             waiting[count, 0], waiting[count, 1] = first_ns, row
             count += 1
     return count
@@ -245,15 +254,12 @@ def _run_all(
 
 @kernel
 def leave_all(
-    vehicles: Records,
-    links: Records,
-    entries: Records,
-    frames: Bytes,
-    leaving: Ints,
-    data: Bytes,
-    now_ns: int,
-) -> int:
-    """Take datagrams that leave their up links by now; returns how many, at most as many as `leaving` has columns.
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, truth: Records,
+    leaving: Ints, data: Bytes, now_ns: int,
+) -> int:  # fmt: skip
+    """Take datagrams that leave their up links by now; returns how many.
+
+    More than `leaving` has columns or `truth` has rows for are left to the next call.
 
     The rows of `leaving` say of each where it begins and ends in `data`, the vehicle's row, and its time.
     """
@@ -261,13 +267,14 @@ def leave_all(
     for row in range(len(vehicles)):
         link = links[row_of(row, LINK_UP)]
         while link.next_due_ns <= now_ns and link.under_way > 0:
-            if count == leaving.shape[1]:
+            if count == leaving.shape[1] or not can_record(truth):
                 return count
             entry = take(link, entries)
             begin, end = end, end + entries[entry].size
             copy_bytes(data, begin, frames[entry], 0, entries[entry].size)
             leaving[0, count], leaving[1, count], leaving[2, count] = begin, end, row
-            leaving[3, count] = entries[entry].due_ns
+            leaving[3, count] = due_ns = entries[entry].due_ns
+            record_datagram(truth, link, entries[entry], frames[entry], now_ns, due_ns, entries[entry].fate)
             count += 1
     return count
 
@@ -284,7 +291,7 @@ def next_leaving_ns(vehicles: Records, links: Records) -> int:
 
 @kernel
 def step_all(
-    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records,
+    vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     data: Bytes, received: Ints, waiting: Ints, leaving: Ints, leaving_data: Bytes, first: int, now_ns: int,
 ) -> tuple[int, int, int]:  # fmt: skip
     """Let datagrams enter, from the first one on, run the vehicles until now, and take what leaves by then.
@@ -292,10 +299,10 @@ def step_all(
     Returns the results of `_enter_all`, `_run_all` and `leave_all`. If not all could enter, nothing else is done yet;
     if vehicles wait, nothing leaves yet.
     """
-    entered = _enter_all(links, entries, frames, draws, data, received, first)
+    entered = _enter_all(links, entries, frames, draws, truth, data, received, first)
     if entered < received.shape[1]:
         return entered, 0, 0
-    waits = _run_all(vehicles, links, entries, frames, draws, waiting, now_ns)
+    waits = _run_all(vehicles, links, entries, frames, draws, truth, waiting, now_ns)
     if waits:
         return entered, waits, 0
-    return entered, 0, leave_all(vehicles, links, entries, frames, leaving, leaving_data, now_ns)
+    return entered, 0, leave_all(vehicles, links, entries, frames, truth, leaving, leaving_data, now_ns)

@@ -13,12 +13,12 @@ import numpy as np
 
 from scenarios import schema
 from scenarios.networks import wire_id
-from sim_vehicles.links.truth import ACTED, SAMPLED, Record
+from sim_vehicles.links.truth import ACTED, SAMPLED, Recorder, rows_of
 from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
-from sim_vehicles.services.frames import FRAME_BYTES, PAYLOAD
+from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.hot import COUNTED, Place, new_vehicles, place_in
 from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
@@ -57,11 +57,12 @@ class Radio:
         scenario: schema.Scenario,
         own: schema.Vehicle,
         start_ns: int,
-        record: Record | None = None,
+        recorder: Recorder | None = None,
         place: Place | None = None,
     ) -> None:
         self.place = place or place_in(new_vehicles(1))
-        self.place.columns["system_id"][self.place.row] = wire_id(own.system_id)
+        for name, number in (("system_id", own.system_id), ("wire_id", wire_id(own.system_id))):
+            self.place.columns[name][self.place.row] = number
         self.system_id = own.system_id
         self.start_ns = start_ns
         self.counters: Counter[str] = Counter()
@@ -70,7 +71,8 @@ class Radio:
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.schedule = Schedule(self.clock, self.place)
         self.encoder = mavlink.Encoder(self.place)
-        self.record = record
+        self.recorder = recorder
+        self.truth_rows = rows_of(recorder)
         self.out: list[tuple[bytes, int]] = []
         """Frames sent in this step, with their instants."""
 
@@ -96,13 +98,13 @@ class Radio:
 
     def acted(self, setpoint_boot_ms: int, time_ns: int) -> None:
         """Record in the truth log that a set-point acts from now on."""
-        if self.record is not None:
-            self.record((ACTED, self.system_id, setpoint_boot_ms, time_ns, time_ns, time_ns))
+        if self.recorder is not None:
+            self.recorder.add((ACTED, self.system_id, setpoint_boot_ms, time_ns, time_ns, time_ns))
 
     def sampled(self, boot_ms: int, time_ns: int) -> None:
         """Record in the truth log when the state in a position report was sampled."""
-        if self.record is not None:
-            self.record((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
+        if self.recorder is not None:
+            self.recorder.add((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
         self.clock = clock
@@ -232,16 +234,13 @@ class Shell(Generic[Flown]):
     def _reports_plainly(self, time_ns: int) -> bool:
         """Send the report that is due, if a kernel can."""
         radio, (vehicles, _, row) = self.radio, self.radio.place
-        size = report_at(vehicles, row, self._frames) if self.craft.is_plain else UNUSUAL
+        size = report_at(vehicles, row, self._frames, radio.truth_rows) if self.craft.is_plain else UNUSUAL
         if size == MOVE_FIRST:
             self.craft.move(time_ns)
-            size = report_at(vehicles, row, self._frames)
+            size = report_at(vehicles, row, self._frames, radio.truth_rows)
         if size == UNUSUAL:
             return False
-        frame = self._frames[1, :size].tobytes()
-        if mavlink.message_id(frame) == mavlink.LOCAL_POSITION:
-            radio.sampled(_boot_ms(frame), time_ns)
-        radio.send(frame, time_ns)
+        radio.send(self._frames[1, :size].tobytes(), time_ns)
         return True
 
     def _hears_plainly(self, data: bytes, time_ns: int) -> bool:
@@ -250,16 +249,14 @@ class Shell(Generic[Flown]):
             return False
         radio, (vehicles, _, row) = self.radio, self.radio.place
         received = np.frombuffer(data, np.uint8)
-        size = hear_at(vehicles, row, received, time_ns, self._frames)
+        size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
         if size == MOVE_FIRST:
             self.craft.move(self.craft.acts_at(time_ns))
-            size = hear_at(vehicles, row, received, time_ns, self._frames)
+            size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
         if size == UNUSUAL:
             return False
         if size != SILENT:
             radio.send(self._frames[1, :size].tobytes(), time_ns)
-        elif mavlink.message_id(data) == mavlink.SETPOINT:
-            radio.acted(_boot_ms(data), self.craft.acts_at(time_ns))
         return True
 
     def _receive(self, data: bytes, time_ns: int) -> None:
@@ -272,7 +269,7 @@ class Shell(Generic[Flown]):
                 self._take_heartbeat(source, message, time_ns)
             elif isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
-            elif not mavlink.is_for(message, self.radio.encoder.system_id):
+            elif not mavlink.is_for(message, self.radio.encoder.wire_id):
                 counters["ignored_not_addressed"] += 1
             elif authority.obeys(source, message, time_ns):
                 self._obey(message, self.craft.acts_at(time_ns))
@@ -291,7 +288,7 @@ class Shell(Generic[Flown]):
             self.craft.hear_heartbeat(time_ns)
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
-        if message.target_system not in (0, self.radio.encoder.system_id):
+        if message.target_system not in (0, self.radio.encoder.wire_id):
             self.radio.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
             self.radio.counters["timesync_requests"] += 1
@@ -327,8 +324,3 @@ class Shell(Generic[Flown]):
             radio.send(radio.encoder.pack(message), time_ns)
         if answer is not None and answer[1]:
             radio.say(time_ns, answer[1])
-
-
-def _boot_ms(frame: bytes) -> int:
-    """The time_boot_ms with which the payloads of set-points and position reports begin."""
-    return int.from_bytes(frame[PAYLOAD : PAYLOAD + 4], "little")

@@ -16,7 +16,7 @@ from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links, Outage
 from scenarios.schema import Clocks, FixedGains, Monitor, Safety
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.links.truth import DTYPE, LINK_UP, SAMPLED, Row
+from sim_vehicles.links.truth import LINK_UP, SAMPLED, MemoryRecorder
 from sim_vehicles.services.clock import BootClock
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -63,11 +63,11 @@ def flown(name: str) -> tuple[TickArray, Truth]:
         }
     )
     _, plan = flight_plan(scenario)
-    rows: list[Row] = []
-    station, fleet = Station(plan, start_ns=START_NS), Fleet(scenario, START_NS, record=rows.append)
+    recorder = MemoryRecorder()
+    station, fleet = Station(plan, start_ns=START_NS), Fleet(scenario, START_NS, recorder=recorder)
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=fleet)))
     assert station.end_reason == "completed: duration reached"
-    return ticks, np.array([row if len(row) == 8 else (*row, 0, 0) for row in rows], DTYPE)
+    return ticks, recorder.records
 
 
 @pytest.mark.parametrize("name", [name for name in GRID if name != "bunches"])

@@ -41,3 +41,17 @@ def test_a_datagram_arrives_between_sending_and_reading_and_waits() -> None:
                 assert datagram.queued_ns <= read_ns - before_ns + 50_000
             waited_ns = sorted(datagram.queued_ns for datagram in came)
             assert waited_ns[25] >= wait_ns - 50_000  # the kernel may hand single ones over late
+
+
+def test_senders_are_known_by_their_addresses_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gcs.drive.udp._MOST_ADDRESSES", 10)
+    with StationSocket("127.0.0.1", 0) as link:
+        for number in range(40):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+                peer.bind(("127.0.0.1", 0))
+                peer.sendto(bytes([number]), link.address)
+                [came] = link.receive()
+                assert (came.data, came.address) == (bytes([number]), (*peer.getsockname(), 0))
+                sent = link.send([(b"answer", came.address)])
+                assert [(one.data, one.address) for one in sent] == [(b"answer", came.address)]
+                assert peer.recv(100) == b"answer"

@@ -26,7 +26,7 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from sim_vehicles.links.truth import DTYPE, Row
+from sim_vehicles.links.truth import MemoryRecorder
 from sim_vehicles.services.clock import BootClock
 from tests.soak.soak_experiments import Experiment, Fault
 from tests.soak.soak_scenarios import AUTOPILOT_START_S
@@ -178,11 +178,11 @@ class World:
 def fly(experiment: Experiment, plan: FlightPlan) -> Flown:
     """Fly an experiment once."""
     scenario = plan.scenario
-    rows: list[Row] = []
+    recorder = MemoryRecorder()
     ids = plan.formation.system_ids
     signed = signed_links(KEY, ids, epoch_ns=EPOCH_NS, stamps=Stamps()) if experiment.signed else None
     guard = Guard(KEY, epoch_ns=EPOCH_NS, stamps=Stamps()) if experiment.signed else None
-    fleet = Fleet(scenario, START_NS, record=rows.append, signed=signed)
+    fleet = Fleet(scenario, START_NS, recorder=recorder, signed=signed)
     clocks = {system_id: fleet.vehicle(system_id).radio.clock for system_id in ids}
     world = World(experiment, fleet)
     deaths = [fault for fault in experiment.faults if fault.kind == "station replaced"]
@@ -200,7 +200,7 @@ def fly(experiment: Experiment, plan: FlightPlan) -> Flown:
         steps_ns = {system_id: min(first_ns, steps_ns.get(system_id, first_ns)) for system_id in ids}
     for stretch in stretches:
         world.digest.update(stretch.ticks.tobytes())
-    truth = np.array([row if len(row) == 8 else (*row, 0, 0) for row in rows], DTYPE)
+    truth = recorder.records
     silent = [fault for fault in experiment.faults if fault.kind in ("silence", "killed", "station replaced")]
     silences_s = [fault.until_s - fault.from_s for fault in silent]
     return Flown(plan, stretches, truth, clocks, steps_ns, silences_s, world.set_points, world.digest.hexdigest())

@@ -32,7 +32,7 @@ from scenarios.files import dump, load, parse, with_loop
 from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import FixedGains, Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
+from sim_vehicles.links.truth import ACTED, SAMPLED, MemoryRecorder
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -175,9 +175,9 @@ def test_loop_delays_measured_are_those_of_the_truth(name: str) -> None:
         needy = scenario.control.model_copy(update={"gains": gains, "delay_margin_s": None})
         scenario = scenario.model_copy(update={"control": needy})
     _, plan = flight_plan(scenario.model_copy(update={"duration_s": 3.0, "clocks": still}))
-    records: list[Any] = []
-    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=Fleet(plan.scenario, START_NS, record=records.append))))
-    truth = np.array([(*row, *(0,) * (8 - len(row))) for row in records], DTYPE)
+    recorder = MemoryRecorder()
+    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=Fleet(plan.scenario, START_NS, recorder=recorder))))
+    truth = recorder.records
     sampled, acted = instants(truth, SAMPLED), instants(truth, ACTED)
     true_s = true_loop_delays_s(ticks, truth)
     # whose states are needed; with none, when its own v_d comes is all that is late

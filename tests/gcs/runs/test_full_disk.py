@@ -11,6 +11,7 @@ import pytest
 
 from gcs.control.tick import Event
 from gcs.errors import InputError
+from gcs.link.datagram import Frames
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
 from gcs.stress.campaign import trials_of
@@ -42,7 +43,7 @@ def test_the_tick_log_ends_with_its_last_whole_tick(part: int, tmp_path: Path) -
     with disk_full_at(ticks[:20].nbytes + part):
         for rows in ticks[20:40]:
             writer.tick(rows)
-            writer.frames([(b"frame", 1, ("", 0, 0))])
+            writer.frames(Frames([(b"frame", 1, ("", 0, 0))]))
     for rows in ticks[40:]:  # there is room again, but a gap would look like ticks that were missed
         writer.tick(rows)
     writer.event(Event(time_s=1.2, kind="end", text="completed: duration reached"))

@@ -17,7 +17,7 @@ from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Scenario
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.links.truth import SAMPLED, Row
+from sim_vehicles.links.truth import SAMPLED, MemoryRecorder
 from tests.support.fleets.flown_copters import three
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -37,8 +37,8 @@ class Watched:
     """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
 
     def __init__(self, scenario: Scenario, *, timesync_hz: float, position_hz: float = 0.0) -> None:
-        self.rows: list[Row] = []
-        self.fleet = Fleet(scenario, START_NS, record=self.rows.append)
+        self.truth = MemoryRecorder()
+        self.fleet = Fleet(scenario, START_NS, recorder=self.truth)
         self.watch = Watch()
         self.requests = Requests(timesync_hz, position_hz)
         self.now_ns = START_NS
@@ -71,7 +71,7 @@ class Watched:
 
     def _true_age_s(self) -> float:
         boot_ms = self.watch.vehicles[1].boot_ns // MS
-        sampled = [row[3] for row in self.rows if row[:3] == (SAMPLED, 1, boot_ms)]
+        sampled = [row[3] for row in self.truth.records.tolist() if row[:3] == (SAMPLED, 1, boot_ms)]
         return (self.now_ns - sampled[-1]) * 1e-9 if sampled else np.nan
 
 

@@ -5,7 +5,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
 from sim_vehicles.drive.fleet import Datagram, Fleet
-from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, Row
+from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, MemoryRecorder
 from tests.support.sim_client import (
     MS,
     SECOND,
@@ -74,7 +74,7 @@ def test_it_does_not_matter_how_often_it_is_stepped() -> None:
 
 @pytest.mark.parametrize("reordering", [False, True])
 def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
-    """With a truth log every event goes through the shell."""
+    """Of vehicles that are not plain every event goes through the shell; what happened is recorded in either way."""
     link = Link(
         delay_s=0.03,
         jitter=Jitter(distribution="normal", scale_s=0.02),
@@ -84,15 +84,27 @@ def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
         corrupt_probability=0.05,
     )
     own = scenario(COUNT).model_copy(update={"links": Links(up=link, down=link)})
-    rows: list[Row] = []
-    plain, recorded = Fleet(own, START), Fleet(own, START, record=rows.append)
-    assert flight(plain) == flight(recorded)
-    assert plain.counters == recorded.counters
-    assert plain.next_event_ns == recorded.next_event_ns
+    recorders = MemoryRecorder(), MemoryRecorder()
+    plain, shells = (Fleet(own, START, recorder=recorder) for recorder in recorders)
+    shells.vehicle(1).radio.place.vehicles["plain"] = False
+    assert flight(plain) == flight(shells) == flight(Fleet(own, START))
+    assert plain.counters == shells.counters
+    assert plain.next_event_ns == shells.next_event_ns
     assert [plain.state(k, START + 3 * SECOND) for k in plain.system_ids] == [
-        recorded.state(k, START + 3 * SECOND) for k in plain.system_ids
+        shells.state(k, START + 3 * SECOND) for k in plain.system_ids
     ]
-    assert sum(row[0] == ACTED for row in rows) > 100
+    records = [sorted(recorder.records.tolist()) for recorder in recorders]
+    assert records[0] == records[1]
+    assert sum(kind == ACTED for kind, *_ in records[0]) > 100
+
+
+@pytest.mark.parametrize("rows", [6, 7, 50])
+def test_nothing_is_lost_when_there_is_no_room_for_more_records(rows: int) -> None:
+    link = Link(delay_s=0.03, loss_probability=0.1, duplicate_probability=0.2, corrupt_probability=0.05)
+    own = scenario(COUNT).model_copy(update={"links": Links(up=link, down=link)})
+    roomy, narrow = MemoryRecorder(), MemoryRecorder(rows)
+    assert flight(Fleet(own, START, recorder=roomy)) == flight(Fleet(own, START, recorder=narrow))
+    assert sorted(roomy.records.tolist()) == sorted(narrow.records.tolist())
 
 
 def test_what_is_returned_is_due_and_in_order() -> None:
@@ -144,9 +156,10 @@ def test_the_true_state_is_known_at_any_time() -> None:
 
 
 def test_the_truth_logs_sampling_and_acting_instants() -> None:
-    rows: list[Row] = []
-    fleet = Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START, record=rows.append)
+    recorder = MemoryRecorder()
+    fleet = Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START, recorder=recorder)
     out = flight(fleet)
+    rows = recorder.records.tolist()
     sampled = {row[1:3]: row[3] for row in rows if row[0] == SAMPLED}
     positions = [(d, parse(d[1])) for d in out if parse(d[1]).get_type() == "LOCAL_POSITION_NED"]
     assert len(positions) > 300

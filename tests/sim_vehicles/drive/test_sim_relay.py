@@ -21,7 +21,7 @@ from scenarios.keys.link import Jitter, Links
 from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.links.links import CAPACITY, LinkSet
 from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
-from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth
+from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, MemoryRecorder, read_truth
 from sim_vehicles.services.clock import NEVER_NS
 from tests.support.processes import free_port
 from tests.support.sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
@@ -76,14 +76,14 @@ def test_no_datagram_makes_the_relay_stumble(data: bytes) -> None:
 @pytest.mark.parametrize("kind", [LINK_UP, LINK_DOWN])
 def test_a_relayed_datagram_has_the_fate_of_a_simulated_one(kind: int) -> None:
     sent = [Passing(START + k * 2 * MS, kind, 2, frame(2, k)) for k in range(500)]
-    rows: list[Row] = []
-    came = through(Relay(wild(), START, record=rows.append), sent)
+    recorder = MemoryRecorder()
+    came = through(Relay(wild(), START, recorder=recorder), sent)
     alone = LinkSet(wild(), START).of(2)[kind != LINK_UP]
     for passing in sent:
         alone.send(passing.data, passing.time_ns)
     assert [(p.time_ns, p.data) for p in came] == [(entry[0], entry[3]) for entry in alone.due(NEVER_NS)]
-    fates = np.array([row[6] for row in rows if len(row) == 8])
-    assert len(rows) == len(came) + alone.dropped  # every datagram has its record
+    fates = recorder.records["fate"]
+    assert len(fates) == len(came) + alone.dropped  # every datagram has its record
     for fate, share in ((LOST, 0.2), (DUPLICATE, 0.08), (CORRUPTED, 0.08)):  # 0.1 of those not lost
         # four standard errors of a share of 500
         assert np.mean(fates & fate != 0) == pytest.approx(share, abs=4 * (share * (1 - share) / 500) ** 0.5)

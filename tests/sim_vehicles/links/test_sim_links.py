@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scenarios.keys import link as link_keys
 from scenarios.keys.link import DelayPoint, Jitter, LossBursts, Outage
 from sim_vehicles.links.links import Entry, Link
-from sim_vehicles.links.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
+from sim_vehicles.links.queue import new_queues
+from sim_vehicles.links.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, MemoryRecorder
 from sim_vehicles.services.clock import NEVER_NS
 
 MS = 1_000_000
@@ -44,13 +45,13 @@ def test_datagrams_leave_once_in_order_of_time_and_entry(entered: list[int], loo
 
 @pytest.mark.parametrize("jitter", [None, Jitter(distribution="uniform", scale_s=1e-9)])
 def test_a_full_link_drops_what_comes_and_counts_it(jitter: Jitter | None) -> None:
-    rows: list[Row] = []
-    link = Link(link_keys.Link(delay_s=1.0, jitter=jitter), capacity=3, record=rows.append)
+    recorder = MemoryRecorder()
+    link = Link(link_keys.Link(delay_s=1.0, jitter=jitter), capacity=3, queues=new_queues(1, recorder))
     for number in range(5):
         link.send(bytes([number]), number)
     assert (link.entered, link.dropped, link.under_way) == (5, 2, 3)
     assert [data for data, _ in times(link.due(10**10))] == [b"\0", b"\1", b"\2"]
-    assert rows == [(LINK_UP, 0, 0xFFFFFF, k, k, k, LINK_FULL, 0) for k in (3, 4)]
+    assert recorder.records.tolist() == [(LINK_UP, 0, 0xFFFFFF, k, k, k, LINK_FULL, 0) for k in (3, 4)]
     link.send(b"again", 0)
     assert link.dropped == 2
 
@@ -113,15 +114,18 @@ def test_before_link_time_zero_the_first_delay_applies_without_outage() -> None:
 
 
 def test_an_outage_includes_its_start_not_its_end() -> None:
-    rows: list[Row] = []
+    recorder = MemoryRecorder()
     link = Link(
-        link_keys.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))), record=rows.append
+        link_keys.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))),
+        queues=new_queues(1, recorder),
     )
     link.zero_ns = 0
     for time_ns in (0, SECOND - 1, SECOND, 2 * SECOND - 1, 2 * SECOND, 3 * SECOND, 4 * SECOND):
         link.send(b"x", time_ns)
     assert [due_ns for _, due_ns in times(link.due(NEVER_NS))] == [0, SECOND - 1, 2 * SECOND, 4 * SECOND]
-    assert [(row[3], row[6:]) for row in rows] == [(t, (OUTAGE, 0)) for t in (SECOND, 2 * SECOND - 1, 3 * SECOND)]
+    assert [(row[3], row[6:]) for row in recorder.records.tolist()] == [
+        (t, (OUTAGE, 0)) for t in (SECOND, 2 * SECOND - 1, 3 * SECOND)
+    ]
 
 
 probability = st.sampled_from([0.0, 0.05, 0.5, 1.0])
@@ -145,9 +149,11 @@ misbehaving = st.builds(
 arrivals = st.lists(st.integers(0, 50 * MS), max_size=60).map(sorted)
 
 
-def passed(behaviour: link_keys.Link, entered: list[int], seed: int, rows: list[Row]) -> tuple[Link, list[Entry]]:
+def passed(
+    behaviour: link_keys.Link, entered: list[int], seed: int, recorder: MemoryRecorder | None = None
+) -> tuple[Link, list[Entry]]:
     """The link and what came out of it, the last second included, when numbered datagrams entered at these times."""
-    link = Link(behaviour, capacity=20, seed=seed, record=rows.append)
+    link = Link(behaviour, capacity=20, seed=seed, queues=new_queues(1, recorder))
     link.zero_ns = 0
     out: list[Entry] = []
     for number, time_ns in enumerate(entered):
@@ -163,12 +169,13 @@ def passed(behaviour: link_keys.Link, entered: list[int], seed: int, rows: list[
 def test_nothing_is_invented_and_nothing_disappears_unrecorded(
     behaviour: link_keys.Link, entered: list[int], seed: int
 ) -> None:
-    rows: list[Row] = []
-    link, out = passed(behaviour, entered, seed, rows)
+    recorder = MemoryRecorder()
+    link, out = passed(behaviour, entered, seed, recorder)
     assert link.under_way == 0
-    assert link.entered + link.counts["duplicated"] == len(out) + len(rows)
-    assert len(rows) == link.dropped
-    assert all(row[6] & DROPPED for row in rows if len(row) == 8)
+    fates = recorder.records["fate"]
+    assert link.entered + link.counts["duplicated"] == len(out) + len(fates)
+    assert len(fates) == link.dropped
+    assert (fates & DROPPED != 0).all()
     whole = Counter(data for _, _, _, data, fate, _ in out if not fate & CORRUPTED)
     assert all(0 <= int(data) < len(entered) for data in whole)
     twice = Counter(data for _, _, _, data, fate, _ in out if fate & DUPLICATE and not fate & CORRUPTED)
@@ -184,7 +191,7 @@ def test_nothing_is_invented_and_nothing_disappears_unrecorded(
 def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
     behaviour: link_keys.Link, entered: list[int], seed: int
 ) -> None:
-    _, out = passed(behaviour, entered, seed, [])
+    _, out = passed(behaviour, entered, seed)
     numbers = [number for _, number, *_ in out]
     assert numbers == sorted(numbers)
 
@@ -192,7 +199,7 @@ def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
 def test_with_reordering_some_do() -> None:
     jitter = Jitter(distribution="uniform", scale_s=0.03)
     link = link_keys.Link(delay_s=0.03, jitter=jitter, reordering=True)
-    _, out = passed(link, [k * MS for k in range(20)], 1, [])
+    _, out = passed(link, [k * MS for k in range(20)], 1)
     numbers = [number for _, number, *_ in out]
     assert sorted(numbers) == list(range(1, 21))
     assert numbers != sorted(numbers)

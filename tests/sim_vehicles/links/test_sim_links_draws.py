@@ -16,7 +16,8 @@ from scipy import stats
 from scenarios.keys import link as link_keys
 from scenarios.keys.link import Jitter, LossBursts
 from sim_vehicles.links.links import Link, LinkSet
-from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, Row
+from sim_vehicles.links.queue import new_queues
+from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, MemoryRecorder
 from sim_vehicles.services.clock import NEVER_NS
 from tests.support.sim_client import scenario
 
@@ -88,13 +89,13 @@ def test_independent_loss_duplication_and_corruption_have_their_probabilities(wa
 
 def test_bursts_follow_the_gilbert_elliott_model() -> None:
     p, r = 0.02, 0.2
-    rows: list[Row] = []
+    recorder = MemoryRecorder()
     burst = LossBursts(to_bad_probability=p, to_good_probability=r)
-    link = Link(link_keys.Link(loss_bursts=burst), capacity=COUNT, record=rows.append)
+    link = Link(link_keys.Link(loss_bursts=burst), capacity=COUNT, queues=new_queues(1, recorder))
     for k in range(COUNT):
         link.send(b"", k)
     lost = np.zeros(COUNT, bool)
-    lost[[row[3] for row in rows]] = True
+    lost[recorder.records["time_ns"]] = True
     bad = p / (p + r)
     # Neighbours agree: the variance of the mean is (1 + c) / (1 - c) times that of independent losses, c = 1 - p - r.
     error = math.sqrt(bad * (1 - bad) / COUNT * (2 - p - r) / (p + r))

@@ -19,7 +19,7 @@ ROWS: list[Row] = [
 def write(path: Path, rows: list[Row]) -> None:
     log = TruthLog(path)
     for row in rows:
-        log.record(row)
+        log.add(row)
     log.close()
 
 
@@ -41,9 +41,9 @@ def test_what_is_left_out_of_a_record_is_zero(tmp_path: Path) -> None:
 
 def test_a_flushed_batch_survives_without_close(tmp_path: Path) -> None:
     log = TruthLog(tmp_path / "truth")
-    log.record(ROWS[0])
+    log.add(ROWS[0])
     log.flush()
-    log.record(ROWS[1])
+    log.add(ROWS[1])
     assert read_truth(tmp_path / "truth").tolist() == ROWS[:1]
     log.close()
 
@@ -74,16 +74,16 @@ def test_a_full_disk_loses_records_and_nothing_else(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     try:
         log = TruthLog(path)
-        log.record(ROWS[0])
+        log.add(ROWS[0])
         log.flush()
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + DTYPE.itemsize + 5, limit[1]))
         for row in ROWS:  # room for one of them and a piece of the second
-            log.record(row)
+            log.add(row)
         log.flush()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
         signal.signal(signal.SIGXFSZ, before)
-    log.record(ROWS[2])
+    log.add(ROWS[2])
     log.close()
     assert log.lost == 2
     assert read_truth(path).tolist() == [ROWS[0], ROWS[0], ROWS[2]]

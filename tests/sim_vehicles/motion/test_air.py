@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
 from scenarios.schema import Autopilot, Limits, Scenario
-from sim_vehicles.links.truth import DTYPE, POSITION_ERROR, PUSHED, VELOCITY_ERROR, Row, disturbances
+from sim_vehicles.links.truth import POSITION_ERROR, PUSHED, VELOCITY_ERROR, MemoryRecorder, disturbances
 from sim_vehicles.motion import air, copter
 from sim_vehicles.motion.double_integrator import Command, State, advance, bounds_of, shifted, state_from
 from sim_vehicles.motion.navigation import Navigator
@@ -19,10 +19,6 @@ UNLIMITED = bounds_of(Limits())
 
 def disturbed(count: int = 1, **parts: object) -> Scenario:
     return scenario(count).model_copy(update={"disturbance": Disturbance.model_validate(parts)})
-
-
-def truth(rows: list[Row]) -> np.ndarray:
-    return np.array([(*row, 0, 0) for row in rows], DTYPE)
 
 
 def test_gusts_have_the_variance_and_correlation_asked_for() -> None:
@@ -49,8 +45,8 @@ def test_forgotten_gusts_leave_the_later_ones_as_they_were() -> None:
         assert forgetful.at(number) == whole.at(number)
 
 
-def moved(flown: Scenario, to_ns: int, rows: list[Row], *, push: air.Push = air.STILL) -> State:
-    around = air.Air(flown, 1, START, rows.append)
+def moved(flown: Scenario, to_ns: int, recorder: MemoryRecorder, *, push: air.Push = air.STILL) -> State:
+    around = air.Air(flown, 1, START, recorder)
     around.add(push)
 
     def move(state: State, duration_s: float) -> State:
@@ -60,17 +56,19 @@ def moved(flown: Scenario, to_ns: int, rows: list[Row], *, push: air.Push = air.
 
 
 def test_constant_push_adds_to_the_command_as_in_closed_form() -> None:
-    rows: list[Row] = []
-    reached = moved(disturbed(wind_ne_m_s2=(0.3, 0.2)), START + 4 * SECOND, rows, push=air.Push(0.2, 0.1, 1.5, -2.0))
+    recorder = MemoryRecorder()
+    reached = moved(
+        disturbed(wind_ne_m_s2=(0.3, 0.2)), START + 4 * SECOND, recorder, push=air.Push(0.2, 0.1, 1.5, -2.0)
+    )
     assert reached[:2] == pytest.approx((40.0 * 4 + 0.5 * 1.5 * 16 + 6.0, 9.0 * 4 - 0.5 * 0.2 * 16 - 8.0), rel=1e-12)
     assert reached.velocity_ne_m_s() == pytest.approx((46.0, 8.2), rel=1e-12)
-    assert disturbances(truth(rows), PUSHED, 1)[1].tolist() == [[0.5, pytest.approx(0.3)]]
+    assert disturbances(recorder.records, PUSHED, 1)[1].tolist() == [[0.5, pytest.approx(0.3)]]
 
 
 def test_the_truth_log_holds_the_gusts_that_moved_the_vehicle() -> None:
-    rows: list[Row] = []
-    reached = moved(disturbed(gusts=GUSTS), START + SECOND, rows)
-    times_ns, pushes = disturbances(truth(rows), PUSHED, 1)
+    recorder = MemoryRecorder()
+    reached = moved(disturbed(gusts=GUSTS), START + SECOND, recorder)
+    times_ns, pushes = disturbances(recorder.records, PUSHED, 1)
     assert np.diff(times_ns).tolist() == [air.STEP_NS] * 99
     wanted = np.array([40.0 + 1.0, 9.0 - 0.5]) + 0.01 * pushes.sum(axis=0)
     assert reached.velocity_ne_m_s() == pytest.approx(wanted, abs=1e-8)  # the log rounds to 1e-9 m/s²
@@ -99,8 +97,8 @@ def test_wind_moves_a_copter_as_its_equations_say() -> None:
 
 def test_reports_are_wrong_by_the_noise_and_bias_asked_for() -> None:
     own = Navigation(position_noise_m=0.5, velocity_noise_m_s=0.2, position_bias_m=0.7, bias_time_s=0.1)
-    rows: list[Row] = []
-    navigator = Navigator(scenario().model_copy(update={"navigation": own}), 1, rows.append)
+    recorder = MemoryRecorder()
+    navigator = Navigator(scenario().model_copy(update={"navigation": own}), 1, recorder)
     period_ns = SECOND // 50
     reported = [navigator.reported((1.0, 2.0), (3.0, 4.0), START + k * period_ns, 20 * k) for k in range(20_000)]
     off = np.array(reported) - [[1.0, 2.0], [3.0, 4.0]]
@@ -108,7 +106,7 @@ def test_reports_are_wrong_by_the_noise_and_bias_asked_for() -> None:
     assert off.std(axis=0) == pytest.approx(np.array([[0.74**0.5] * 2, [0.2] * 2]), rel=0.06)
     next_to = (off[1:, 0] * off[:-1, 0]).mean()
     assert next_to == pytest.approx(0.49 * np.exp(-0.2), rel=0.1)
-    logged = [disturbances(truth(rows), kind, 1)[1] for kind in (POSITION_ERROR, VELOCITY_ERROR)]
+    logged = [disturbances(recorder.records, kind, 1)[1] for kind in (POSITION_ERROR, VELOCITY_ERROR)]
     assert np.allclose(np.stack(logged, axis=1), off, rtol=0.0, atol=1e-9)
 
 

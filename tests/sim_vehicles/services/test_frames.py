@@ -1,8 +1,13 @@
 """The numbers in the frames that kernels read and make are those of the dialect."""
 
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.services import frames
+from sim_vehicles.services.frames import first_message
+from sim_vehicles.services.mavlink import message_id
 
 
 def test_message_ids_and_extras_are_those_of_the_dialect() -> None:
@@ -18,3 +23,11 @@ def test_message_ids_and_extras_are_those_of_the_dialect() -> None:
     assert frames.STATION_TYPE == dialect.MAV_TYPE_GCS
     assert frames.LOCAL_NED == dialect.MAV_FRAME_LOCAL_NED
     assert frames.ARDUPILOT == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+
+
+@given(st.binary(max_size=14), st.booleans())
+def test_the_kernel_finds_the_message_id_that_the_codec_finds(data: bytes, framed: bool) -> None:
+    data = b"\xfd" + data if framed else data
+    array = np.zeros(20, np.uint8)
+    array[: len(data)] = np.frombuffer(data, np.uint8)
+    assert first_message(array, len(data)) == message_id(data)

@@ -1,0 +1,221 @@
+"""UDP sockets read and written by kernels: no object is made for a datagram.
+
+The kernels call the C library with the layouts of 64-bit Linux. They use one array of 64-bit integers for all that
+passes between them: a `struct msghdr`, then an `iovec`, the ancillary data, a `sockaddr_in` and a `timespec`.
+"""
+
+import errno
+import socket
+import time  # noqa: TID251 - the drivers read their clock here
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenarios.kernel import kernel
+
+Bytes = NDArray[np.uint8]
+Ints = NDArray[np.int64]
+
+_LONGEST_DATAGRAM = 2048
+_MOST_DATAGRAMS, _MOST_BYTES = 4096, 1 << 20
+"""What is read at once; the rest waits in the sockets."""
+NO_ADDRESS = -1
+"""In place of the number of an address: the socket is connected."""
+NS_PER_S = 1_000_000_000
+_SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
+_EAGAIN, _REFUSED = errno.EAGAIN, errno.ECONNREFUSED
+_DONTWAIT, _MONOTONIC, _IPV4 = 0x40, 1, 2
+_NAME, _VECTOR, _CONTROL, _CLOCK, _WORDS = 7, 9, 11, 19, 21
+"""Where the parts of the array begin, and its length."""
+_NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
+_48_BITS = 0xFFFFFFFFFFFF
+
+
+class _External:
+    """A function of the C library, for kernels; Numba is asked for only when one is compiled."""
+
+    def __init__(self, name: str, result: str, *arguments: str) -> None:
+        self._name, self._result, self._arguments = name, result, arguments
+
+    @property
+    def _numba_type_(self) -> Any:
+        from numba import types
+
+        kinds: Any = types
+        result = kinds.CPointer(types.int32) if self._result == "int32*" else getattr(types, self._result)
+        return kinds.ExternalFunction(self._name, result(*(getattr(types, kind) for kind in self._arguments)))
+
+
+_recvmsg: Any = _External("recvmsg", "int64", "int32", "uintp", "int32")
+_sendto: Any = _External("sendto", "int64", "int32", "uintp", "uintp", "int32", "uintp", "uint32")
+_clock_gettime: Any = _External("clock_gettime", "int32", "int32", "uintp")
+_errno: Any = _External("__errno_location", "int32*")
+
+
+class Received(NamedTuple):
+    """A datagram with its receiving socket, the instant at which it reached this host, and its sender."""
+
+    descriptor: int
+    data: bytes
+    time_ns: int
+    address: tuple[str, int]
+
+
+@dataclass(slots=True)
+class Batch:
+    """Datagrams read together; whoever iterates over them gets objects.
+
+    The rows of `table` (5, n) say of each where it begins and ends in `stream`, the number of the address that it is
+    from, when it reached this host, and the descriptor of the socket.
+    """
+
+    stream: Bytes
+    table: Ints
+    read_ns: int
+    errors: int
+    """How many earlier datagrams met a closed port, or were refused otherwise."""
+
+    def __iter__(self) -> Iterator[Received]:
+        data = self.stream.tobytes()
+        for begin, end, number, time_ns, descriptor in self.table.T.tolist():
+            yield Received(descriptor, data[begin:end], time_ns, address_of(number))
+
+
+def stamped(own: socket.socket) -> socket.socket:
+    """The socket, now without waiting and with the kernel's stamps of arrival."""
+    own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+    own.setblocking(False)
+    return own
+
+
+class Reader:
+    """Reads sockets that are `stamped`, at most so many datagrams of each at once."""
+
+    def __init__(self, most_of_each: int = _MOST_DATAGRAMS) -> None:
+        self._most = most_of_each
+        self._buffers = np.empty(_MOST_BYTES, np.uint8), np.empty((5, _MOST_DATAGRAMS), np.int64), _words()
+        self._emptied_ns = time.monotonic_ns()
+
+    def read(self, descriptors: Sequence[int] | Ints) -> Batch:
+        """What has arrived at these sockets; no others may have datagrams that were not read."""
+        begin_ns, to_monotonic_ns = time.monotonic_ns(), -realtime_offset_ns()
+        count, end, errors, empty = _read(np.asarray(descriptors, np.int64), self._most, *self._buffers)
+        read_ns = time.monotonic_ns()
+        stream, table = self._buffers[0][:end].copy(), self._buffers[1][:, :count].copy()
+        # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
+        stamps_ns = np.where(table[3] == 0, read_ns, table[3] + to_monotonic_ns)
+        table[3] = stamps_ns.clip(self._emptied_ns, read_ns)
+        if empty:
+            self._emptied_ns = begin_ns
+        return Batch(stream, table, read_ns, errors)
+
+
+class Writer:
+    """Sends datagrams."""
+
+    def __init__(self) -> None:
+        self._words = _words()
+
+    def write(self, stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> "Sent":
+        """Send datagrams in order, from these sockets to the addresses with these numbers, or to their peers."""
+        sent_ns = np.empty(len(begins), np.int64)
+        refused, failed = _write(stream, begins, ends, descriptors, addresses, sent_ns, self._words)
+        return Sent(sent_ns, refused, failed)
+
+
+class Sent(NamedTuple):
+    """When datagrams had been handed to the kernel, and how many met a closed port or another error."""
+
+    sent_ns: Ints
+    refused: int
+    failed: int
+
+
+def realtime_offset_ns() -> int:
+    """The offset from the monotonic clock to ns since 1970.
+
+    Taken from the quickest of three readings of both clocks, as the process may be interrupted between them.
+    """
+    readings: list[tuple[int, int]] = []
+    for _ in range(3):
+        before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, real_ns - (before_ns + after_ns) // 2))
+    return min(readings)[1]
+
+
+def number_of(address: tuple[str, int]) -> int:
+    """A number for an address, from 0 up."""
+    host, port = address
+    return int.from_bytes(port.to_bytes(2, "big") + socket.inet_aton(host), "little")
+
+
+@lru_cache(maxsize=4096)
+def address_of(number: int) -> tuple[str, int]:
+    data = number.to_bytes(6, "little")
+    return socket.inet_ntoa(data[2:]), int.from_bytes(data[:2], "big")
+
+
+def joined(datagrams: Sequence[bytes]) -> tuple[Bytes, Ints]:
+    """Datagrams as one array, and where each begins, and the last ends."""
+    stream = np.frombuffer(bytearray().join(datagrams), np.uint8)
+    return stream, np.cumsum([0, *map(len, datagrams)])
+
+
+def _words() -> Ints:
+    return np.zeros(_WORDS, np.int64)
+
+
+@kernel
+def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints) -> tuple[int, int, int, bool]:
+    """Read sockets; returns the numbers of datagrams, bytes and errors, and whether all sockets are empty."""
+    base = words.ctypes.data
+    count = end = errors = 0
+    empty = True
+    for descriptor in descriptors:
+        emptied = False
+        for _ in range(most):
+            if count == table.shape[1] or end + _LONGEST_DATAGRAM > len(stream):
+                return count, end, errors, False
+            words[0], words[1], words[2], words[3] = base + 8 * _NAME, _NAME_BYTES, base + 8 * _VECTOR, 1
+            words[4], words[5] = base + 8 * _CONTROL, _CONTROL_BYTES
+            words[_VECTOR], words[_VECTOR + 1] = stream.ctypes.data + end, _LONGEST_DATAGRAM
+            size = _recvmsg(descriptor, base, _DONTWAIT)
+            if size >= 0:
+                stamp_ns = words[_STAMP] * NS_PER_S + words[_STAMP + 1] if words[5] > 0 else 0
+                table[0, count], table[1, count], table[2, count] = end, end + size, words[_NAME] >> 16 & _48_BITS
+                table[3, count], table[4, count] = stamp_ns, descriptor
+                count, end = count + 1, end + size
+            elif _errno()[0] == _EAGAIN:
+                emptied = True
+                break
+            else:
+                errors += 1
+        empty = empty and emptied
+    return count, end, errors, empty
+
+
+@kernel
+def _write(
+    stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, sent_ns: Ints, words: Ints
+) -> tuple[int, int]:
+    """Send datagrams; returns how many met a closed port, and how many another error."""
+    base = words.ctypes.data
+    refused = failed = 0
+    for k in range(len(begins)):
+        name = size = 0
+        if addresses[k] != NO_ADDRESS:
+            words[_NAME], words[_NAME + 1] = addresses[k] << 16 | _IPV4, 0
+            name, size = base + 8 * _NAME, _NAME_BYTES
+        place = stream.ctypes.data + begins[k]
+        if _sendto(descriptors[k], place, ends[k] - begins[k], _DONTWAIT, name, size) < 0:
+            if _errno()[0] == _REFUSED:
+                refused += 1
+            else:
+                failed += 1
+        _clock_gettime(_MONOTONIC, base + 8 * _CLOCK)
+        sent_ns[k] = words[_CLOCK] * NS_PER_S + words[_CLOCK + 1]
+    return refused, failed

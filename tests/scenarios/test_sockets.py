@@ -1,0 +1,89 @@
+"""Datagrams read and sent by kernels, on real sockets."""
+
+import socket
+import time  # noqa: TID251 - what is tested here reads the clock
+from collections.abc import Generator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from scenarios.sockets import NO_ADDRESS, Reader, Writer, address_of, joined, number_of, stamped
+
+
+@pytest.fixture
+def two() -> Generator[tuple[socket.socket, socket.socket]]:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        for own in (one, other):
+            stamped(own).bind(("127.0.0.1", 0))
+        yield one, other
+
+
+@given(st.ip_addresses(v=4), st.integers(0, 65535))
+def test_every_address_has_a_number_of_its_own(host: object, port: int) -> None:
+    number = number_of((str(host), port))
+    assert 0 <= number < 1 << 48
+    assert address_of(number) == (str(host), port)
+
+
+def test_what_is_written_is_read_with_its_sender_and_time(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    data = [bytes([k]) * k for k in range(200)]  # the first is empty
+    stream, ends = joined(data)
+    before_ns = time.monotonic_ns()
+    to = np.full(len(data), number_of(other.getsockname()))
+    sent = Writer().write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to)
+    assert (sent.refused, sent.failed) == (0, 0)
+    assert before_ns < sent.sent_ns[0]
+    assert (np.diff(sent.sent_ns) > 0).all()
+    batch = Reader().read([other.fileno(), one.fileno()])
+    assert [found.data for found in batch] == data
+    assert {(found.descriptor, found.address) for found in batch} == {(other.fileno(), one.getsockname())}
+    assert (batch.table[3] <= batch.read_ns).all()
+    assert other.getsockname() not in {found.address for found in batch}
+
+
+def test_of_each_socket_only_so_many_are_read_at_once(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    for k in range(20):
+        one.sendto(bytes([k]), other.getsockname())
+    other.sendto(b"few", one.getsockname())
+    reader, both = Reader(16), [one.fileno(), other.fileno()]
+    assert [found.data for found in reader.read(both)] == [b"few", *(bytes([k]) for k in range(16))]
+    assert [found.data for found in reader.read(both)] == [bytes([k]) for k in range(16, 20)]
+    assert reader.read(both).table.shape == (5, 0)
+
+
+def test_more_than_there_is_room_for_waits_in_the_socket(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    reader, came, count = Reader(), 0, 0
+    for k in range(3000):
+        one.sendto(k.to_bytes(2, "big") * 500, other.getsockname())
+    while batch := [*reader.read([other.fileno()])]:
+        assert [found.data[:2] for found in batch] == [k.to_bytes(2, "big") for k in range(came, came + len(batch))]
+        came, count = came + len(batch), count + 1
+    assert count > 1 or came < 1000  # a small buffer, where the limit of the host holds
+    assert came > 100
+
+
+def test_closed_ports_are_counted_and_do_not_stop_what_follows(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+        gone.bind(("127.0.0.1", 0))
+        closed = gone.getsockname()
+    one.connect(closed)
+    stream, ends = joined([b"anyone?", b"to you"])
+    descriptors, to = np.array([one.fileno(), other.fileno()]), np.array([NO_ADDRESS, number_of(other.getsockname())])
+    counts = [0, 0]
+    reader, writer = Reader(), Writer()
+    for _ in range(3):
+        counts[0] += writer.write(stream, ends[:-1], ends[1:], descriptors, to).refused
+        counts[1] += reader.read([one.fileno()]).errors
+    assert sum(counts) >= 3
+    assert [found.data for found in reader.read([other.fileno()])] == [b"to you"] * 3
+    assert writer.write(stream, ends[:1], ends[1:2], np.array([10_000]), np.array([NO_ADDRESS])).failed == 1
