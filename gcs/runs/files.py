@@ -3,11 +3,13 @@
 A file that is damaged, or of another kind, raises gcs.errors.InputError with one line.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from gcs.control.tick import TICK, Event, Mode, TickArray
@@ -22,6 +24,9 @@ from scenarios.schema import Scenario
 
 _Record = TypeVar("_Record", bound=Published)
 _EVENT = TypeAdapter(Event)
+
+
+Rows = NDArray[np.void]
 
 
 def read_scenario(folder: Path) -> Scenario:
@@ -115,6 +120,14 @@ def by_tick(rows: TickArray, system_ids: Sequence[int]) -> TickArray:
     ticks = rows[: rows.size // count * count].reshape(-1, count)
     written = ticks["system_id"][:1].ravel().tolist()
     return ticks[:, [written.index(system_id) for system_id in system_ids]] if written else ticks
+
+
+def by_vehicle(rows: Rows) -> defaultdict[int, Rows]:
+    """The rows of each vehicle by its system id, in the order that they have; none for other ids."""
+    order = rows["system_id"].argsort(kind="stable")
+    system_ids, first = np.unique(rows["system_id"][order], return_index=True)
+    found = zip(system_ids.tolist(), np.split(rows[order], first[1:]), strict=False)
+    return defaultdict(lambda: rows[:0], found)
 
 
 class RunTail:

@@ -18,7 +18,7 @@ from gains.core.arrays import FloatArray
 from gcs.control.tick import TickArray
 from gcs.errors import InputError, usable
 from gcs.published import Published
-from gcs.runs.files import read_ticks
+from gcs.runs.files import by_vehicle, read_ticks
 from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
@@ -65,7 +65,9 @@ def grade(folder: Path) -> Grade:
     ticks = read_ticks(folder)
     flown = ticks[ticks["time_s"] >= 0.0]
     system_ids = np.unique(ticks["system_id"]).tolist()
-    trip_errors_s = np.concatenate([_trip_errors_s(ticks, truth, system_id) for system_id in system_ids])
+    ticks_of, truth_of = by_vehicle(ticks), by_vehicle(truth[truth["key"] == _TIMESYNC])
+    trips_s = [_trip_errors_s(ticks_of[system_id], truth_of[system_id], system_id) for system_id in system_ids]
+    trip_errors_s = np.concatenate(trips_s)
     left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
     late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
     return Grade(

@@ -4,7 +4,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from gcs.plan.disturbed import predicted_spread
 from gcs.plan.formation import plan_formation
 from gcs.plan.own_law import code_records
 from gcs.runs import record
-from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.runs.files import RunTail, by_vehicle, read_design, read_scenario, read_ticks
 from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
 from gcs.runs.summary_record import (
     Clock,
@@ -104,12 +104,13 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     not_logged = tuple(
         f"{event.text}, from {event.time_s:.2f} s on" for event in events if event.kind == record.LOG_ENDED
     )
+    ticks_of, flown_of = by_vehicle(ticks), by_vehicle(flown)
     errors = {
-        v.system_id: _error(flown, v.system_id, "spacing_error_{}_m")
+        v.system_id: _error(flown_of[v.system_id], "spacing_error_{}_m")
         for v in scenario.vehicles
         if v.follows is not None
     }
-    settled = _settling_time_s(scenario, errors, flown)
+    settled = _settling_time_s(scenario, errors, flown_of)
     jumps: dict[int | None, list[float]] = defaultdict(list)
     for event in events:
         if event.text == CLOCK_JUMPED:
@@ -141,7 +142,13 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         distance_min_m=np.fmin.reduce(flown["nearest_m"], initial=np.nan),
         duration_s=flown["time_s"].max(initial=0.0),
         vehicles=tuple(
-            _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps_s=jumps[v.system_id])
+            _vehicle(
+                ticks_of[v.system_id],
+                flown_of[v.system_id],
+                v.system_id,
+                errors.get(v.system_id),
+                jumps_s=jumps[v.system_id],
+            )
             for v in scenario.vehicles
         ),
         control=_control(scenario, flown),
@@ -154,9 +161,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
 
 def _medians(rows: TickArray, name: str) -> dict[int, float]:
     """The median of a column for each vehicle that has known values in it, by its system id."""
-    columns = {
-        system_id: rows[name][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"]).tolist()
-    }
+    columns = {system_id: own[name] for system_id, own in by_vehicle(rows[["system_id", name]]).items()}
     return {key: float(np.median(known)) for key, own in columns.items() if (known := own[np.isfinite(own)]).size}
 
 
@@ -184,15 +189,14 @@ def verdict(
     return "unstable" if settling_time_s is None or (headroom_end or 0.0) < 0.0 else "stable"
 
 
-def _error(flown: TickArray, system_id: int, column: str) -> Errors:
+def _error(rows: TickArray, column: str) -> Errors:
     """The norm over north and east of an error of a vehicle, where it is known."""
-    rows = flown[flown["system_id"] == system_id]
     error = np.hypot(rows[column.format("north")], rows[column.format("east")])
     known = np.isfinite(error)
     return rows["time_s"][known], error[known]
 
 
-def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickArray) -> float | None:
+def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Mapping[int, TickArray]) -> float | None:
     """When the last follower came within a fraction of its spacing for good; None if one has not.
 
     A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
@@ -201,7 +205,7 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickA
     if not whole:
         [alone] = (vehicle.system_id for vehicle in scenario.vehicles)
         whole = {alone: max(float(np.hypot(*scenario.nominal_velocity_at(scenario.duration_s))), 1.0)}
-        errors = {alone: _error(flown, alone, "velocity_error_{}_m_s")}
+        errors = {alone: _error(flown_of[alone], "velocity_error_{}_m_s")}
     latest = 0.0
     for system_id, (time_s, error) in errors.items():
         outside = np.flatnonzero(error > scenario.safety.settled_fraction * whole[system_id])
@@ -213,10 +217,9 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickA
 
 
 def _vehicle(
-    ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
+    rows: TickArray, own: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
 ) -> VehicleSummary:
-    rows = ticks[ticks["system_id"] == system_id]
-    own = flown[flown["system_id"] == system_id]
+    """The figures of a vehicle from all its rows, and its own of the flight."""
     sent = own[own["commanded"]]
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
@@ -294,8 +297,9 @@ def _flown_spread(
     from_s = scenario.nominal_velocity[-1].from_s + _DECAYS / predicted.decay_rate_1_s
     flown = flown[flown["time_s"] >= from_s]
     vehicles: list[VehicleFlownSpread] = []
+    flown_of = by_vehicle(flown)
     for own in predicted.vehicles:
-        rows = flown[flown["system_id"] == own.system_id]
+        rows = flown_of[own.system_id]
         square = rows["spacing_error_north_m"] ** 2 + rows["spacing_error_east_m"] ** 2
         square = square[np.isfinite(square)]
         if not square.size:
