@@ -114,14 +114,17 @@ class Block:
 class Outbox:
     """Datagrams to be sent, in order. Iterating over it gives (bytes, address) of each."""
 
-    def __init__(self, parts: Iterable[Outgoing | Block] = ()) -> None:
+    def __init__(self, parts: Sequence[Outgoing] = ()) -> None:
         self.parts: list[Outgoing | Block] = [*parts]
+        self._count = len(parts)
 
     def append(self, each: Outgoing) -> None:
         self.parts.append(each)
+        self._count += 1
 
     def add(self, block: Block) -> None:
         self.parts.append(block)
+        self._count += len(block.rows)
 
     def packed(
         self, number: Callable[[Address], int], numbers: Callable[[Sequence[Address | None]], Ints]
@@ -157,7 +160,7 @@ class Outbox:
                 yield data[k * width : k * width + size], address
 
     def __len__(self) -> int:
-        return sum(len(part.rows) if isinstance(part, Block) else 1 for part in self.parts)
+        return self._count
 
 
 @kernel

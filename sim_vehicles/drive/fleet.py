@@ -187,7 +187,7 @@ class Fleet:
             self._run_waiting(waiting, now_ns)
             leaving = self._leave(now_ns)
         left = self._left(leaving)
-        if leaving < self._leaving.shape[1] and can_record(self._links.queues.truth_rows):
+        if leaving < self._leaving.shape[1] and (self._recorder is None or can_record(self._recorder.rows)):
             return left
         out = [*left]
         while leaving := self._leave(now_ns):
@@ -212,7 +212,7 @@ class Fleet:
     def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records, Records]:
         """What the kernels work on."""
         queues = self._links.queues
-        return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws, queues.truth_rows
+        return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws, queues.truth
 
     def _run_waiting(self, count: int, now_ns: int) -> None:
         """Bring the vehicles up to date that the kernel has left."""

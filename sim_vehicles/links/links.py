@@ -164,7 +164,7 @@ class Link:
         queues, fate = self._queues, NOT_READY
         while fate == NOT_READY:
             fate = enter_at(
-                queues.links, queues.entries, queues.frames, queues.draws, queues.truth_rows, self._row, *entering
+                queues.links, queues.entries, queues.frames, queues.draws, queues.truth, self._row, *entering
             )
             if fate == NOT_READY:
                 self.make_ready()

@@ -74,12 +74,10 @@ class Queues:
     """Of DRAW: the next draws of each link, (n, BLOCK)."""
     columns: Columns
     """Of `links`."""
-    recorder: Recorder | None = None
+    recorder: Recorder | None
     """Where what happens is recorded."""
-
-    @property
-    def truth_rows(self) -> Records:
-        return rows_of(self.recorder)
+    truth: Records
+    """Of the recorder."""
 
     def grow(self) -> None:
         """Double the pool."""
@@ -96,7 +94,7 @@ def new_queues(count: int, recorder: Recorder | None = None) -> Queues:
     links["next_due_ns"], links["drawn"] = NEVER_NS, BLOCK
     _free_from(entries, 1)
     frames, draws = np.zeros((_FIRST_SIZE, FRAME_BYTES), np.uint8), np.zeros((count, BLOCK), DRAW)
-    return Queues(links, entries, frames, draws, Columns(links), recorder)
+    return Queues(links, entries, frames, draws, Columns(links), recorder, rows_of(recorder))
 
 
 def _free_from(entries: Records, first: int) -> None:
