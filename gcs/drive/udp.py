@@ -62,6 +62,18 @@ class _Addresses:
     def __init__(self) -> None:
         self.known: list[Address] = []
         self._numbers: dict[int, int] = {}
+        self._vehicles: list[Address | None] = []
+        self._keys = np.empty(0, np.int64)
+        """The addresses of all vehicles when they were last sent to, and their keys."""
+
+    def packed(self, outbox: Outbox) -> tuple[Bytes, Ints]:
+        """The datagrams as arrays, with the keys of their addresses."""
+        return outbox.packed(_key, self._keys_of)
+
+    def _keys_of(self, vehicles: Sequence[Address | None]) -> Ints:
+        if vehicles != self._vehicles:
+            self._vehicles, self._keys = [*vehicles], np.array([*map(_key, vehicles)], np.int64)
+        return self._keys
 
     def numbers(self, keys: Ints) -> Ints:
         """The numbers of addresses, which may be new."""
@@ -140,18 +152,18 @@ class StationSocket:
     def send(self, outgoing: Outbox | Sequence[Outgoing]) -> Arrivals:
         """Send datagrams; returns them, before they were signed, with when each had been handed to the kernel."""
         outbox = outgoing if isinstance(outgoing, Outbox) else Outbox(outgoing)
-        stream, table = _packed(outbox)
-        signed = (stream, table) if self.guard is None else _packed(Outbox(self.guard.sent(outbox, clock_ns())))
+        stream, table = self._addresses.packed(outbox)
+        signed = (
+            (stream, table)
+            if self.guard is None
+            else self._addresses.packed(Outbox(self.guard.sent(outbox, clock_ns())))
+        )
         begins, ends, keys, _ = signed[1]
         descriptors = self._descriptors[keys >> _NETWORK_BIT]
         sent = self._writer.write(signed[0], begins, ends, descriptors, keys & _ADDRESS_BITS)
         self.send_errors += sent.refused + sent.failed  # full buffers and closed ports are losses: links count them
         table[2], table[3] = self._addresses.numbers(table[2]), sent.sent_ns
         return Arrivals(stream, table, np.zeros(len(sent.sent_ns), np.int64), self._addresses.known)
-
-
-def _packed(outbox: Outbox) -> tuple[Bytes, Ints]:
-    return outbox.packed(_key, lambda to: np.array([*map(_key, to)], np.int64))
 
 
 def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
