@@ -128,7 +128,7 @@ class Writer:
 
 
 class Sent(NamedTuple):
-    """When datagrams had been handed to the kernel, and how many met a closed port or another error."""
+    """When datagrams were handed to the kernel, and how many met a closed port or another error."""
 
     sent_ns: Ints
     refused: int
@@ -211,11 +211,11 @@ def _write(
             words[_NAME], words[_NAME + 1] = addresses[k] << 16 | _IPV4, 0
             name, size = base + 8 * _NAME, _NAME_BYTES
         place = stream.ctypes.data + begins[k]
+        _clock_gettime(_MONOTONIC, base + 8 * _CLOCK)  # before: an answer may come before the call returns
+        sent_ns[k] = words[_CLOCK] * NS_PER_S + words[_CLOCK + 1]
         if _sendto(descriptors[k], place, ends[k] - begins[k], _DONTWAIT, name, size) < 0:
             if _errno()[0] == _REFUSED:
                 refused += 1
             else:
                 failed += 1
-        _clock_gettime(_MONOTONIC, base + 8 * _CLOCK)
-        sent_ns[k] = words[_CLOCK] * NS_PER_S + words[_CLOCK + 1]
     return refused, failed

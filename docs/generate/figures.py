@@ -329,7 +329,7 @@ def too_late(runner: Runner) -> str:
 
 def punctuality(runner: Runner) -> str:
     rows: list[tuple[str, ...]] = []
-    for count in (5, 20, 250):
+    for count in (5, 20, 250, 1000):
         found = runner.json(f"gcs bench scenarios/triangle5.toml --real-time --seconds 20 --vehicles {count}")
         cells = [
             f"{1e3 * found[name]['error_p50_s']:.3f} / {1e3 * found[name]['error_p99_s']:.2f}"

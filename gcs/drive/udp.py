@@ -14,7 +14,6 @@ import socket
 import time  # noqa: TID251 - this is a driver
 from collections import Counter
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Self
 
@@ -24,7 +23,6 @@ from gcs.control.phases import Phase
 from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
-from gcs.link import mavlink
 from gcs.link.datagram import Address, Arrivals, Datagram, Frames, Outbox, Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import MIRROR, RunWriter
@@ -150,7 +148,7 @@ class StationSocket:
         return arrivals
 
     def send(self, outgoing: Outbox | Sequence[Outgoing]) -> Arrivals:
-        """Send datagrams; returns them, before they were signed, with when each had been handed to the kernel."""
+        """Send datagrams; returns them, before they were signed, with when each was handed to the kernel."""
         outbox = outgoing if isinstance(outgoing, Outbox) else Outbox(outgoing)
         stream, table = self._addresses.packed(outbox)
         signed = (
@@ -247,17 +245,19 @@ def drive(
         now_ns = clock_ns()
         requests = Outbox()
         if station.next_event_ns <= now_ns < station.next_tick_ns:
-            requests = station.step([], now_ns)[0]  # before anything is read: a round trip counts from this step
-            log.add(_logged(link.send(requests), now_ns))
+            requests = station.step([], now_ns)[0]  # before anything is read, so that they are sent in time
+            log.add(sent := link.send(requests))
+            station.sent(requests, sent.table[3])
         datagrams = link.receive(station.counters, station.is_another)
         now_ns = clock_ns()
         outgoing, tick = station.step(datagrams, now_ns)
         sent = link.send(outgoing)
+        station.sent(outgoing, sent.table[3])
         if mirror is not None:
             mirror.forward([frame[0] for frames in (station.frames, requests, outgoing) for frame in frames], now_ns)
             link.send(mirror.passed_on(station.vehicles, now_ns))
         log.take(station.frames)
-        log.add(_logged(sent, now_ns))
+        log.add(sent)
         if tick is None:
             continue
         writer.tick(station.complete(tick, sent.table[3]))
@@ -275,10 +275,3 @@ def drive(
     if mirror is not None:
         time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
         writer.event(Event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts))
-
-
-def _logged(sent: Arrivals, now_ns: int) -> Arrivals:
-    """Datagrams sent, as they are logged: set-points with when each was sent, others with the time of their step."""
-    table = sent.table.copy()
-    table[3] = np.where(mavlink.are_set_points(sent.stream, table[0]), table[3], now_ns)
-    return replace(sent, table=table)

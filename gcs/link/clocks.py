@@ -45,7 +45,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.kernel import Cell, Columns, Record, Records, kernel
+from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
 from scenarios.schema import DRIFT_MAX_PPM
 
 WINDOW = 128
@@ -251,18 +251,27 @@ def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
         now_ns += 1
     if clock.pending == len(pending_ns):
         _drop(clock, pending_ns, 0)
-    pending_ns[clock.pending] = now_ns
+    pending_ns[clock.pending, 0] = pending_ns[clock.pending, 1] = now_ns
     clock.pending += 1
-    if now_ns - pending_ns[0] > REQUEST_LIFETIME_NS:
+    if now_ns - pending_ns[0, 0] > REQUEST_LIFETIME_NS:
         _drop(clock, pending_ns, 0)
     return now_ns
+
+
+@kernel
+def note_sent(clocks: Records, pending_ns: NDArray[np.int64], rows: Array, sent_ns: Array) -> None:
+    """Note when the newest requests to some vehicles were sent: after the step that made them."""
+    for k in range(len(rows)):
+        place = clocks[rows[k]].pending - 1
+        if place >= 0:
+            pending_ns[rows[k], place, 1] = sent_ns[k]
 
 
 @kernel
 def _place(clock: Record, pending_ns: NDArray[np.int64], ts1_ns: int) -> int:
     """The place of a request among those pending, oldest first; -1 if it is not among them."""
     for place in range(clock.pending - 1, -1, -1):
-        if pending_ns[place] == ts1_ns:
+        if pending_ns[place, 0] == ts1_ns:
             return place
     return -1
 
@@ -271,7 +280,7 @@ def _place(clock: Record, pending_ns: NDArray[np.int64], ts1_ns: int) -> int:
 def _drop(clock: Record, pending_ns: NDArray[np.int64], place: int) -> None:
     clock.pending -= 1
     for later in range(place, clock.pending):
-        pending_ns[later] = pending_ns[later + 1]
+        pending_ns[later, 0], pending_ns[later, 1] = pending_ns[later + 1, 0], pending_ns[later + 1, 1]
 
 
 @kernel
@@ -330,21 +339,22 @@ def reply(
 ) -> int:
     """Take in a reply; returns the round trip in ns, or UNKNOWN if it answers no request or its time is impossible."""
     place = _place(clock, pending_ns, ts1_ns)
-    if place < 0 or received_ns < ts1_ns or tc1_ns >= LATEST_NS or tc1_ns <= -LATEST_NS:
+    sent_ns = pending_ns[place, 1] if place >= 0 else ts1_ns
+    if place < 0 or received_ns < sent_ns or tc1_ns >= LATEST_NS or tc1_ns <= -LATEST_NS:
         clock.unmatched += 1
         return UNKNOWN
     _drop(clock, pending_ns, place)
-    rtt = received_ns - ts1_ns
+    rtt = received_ns - sent_ns
     clock.rtt_ns = rtt
-    if ts1_ns < clock.since_ns:
+    if sent_ns < clock.since_ns:
         return rtt  # from before a jump that a newer exchange has shown
     clock.doubtful_state = False
-    middle = ts1_ns + rtt // 2
+    middle = sent_ns + rtt // 2
     offset = tc1_ns - middle
-    own = Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - ts1_ns + _READING_NS, ts1_ns)
+    own = Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - sent_ns + _READING_NS, sent_ns)
     gap_ns = _gap_ns(_known_limits(clock), own) if clock.count else 0.0
     if clock.lost or gap_ns > STAMPS_OFF_NS:
-        _jumped(clock, exchanges, ts1_ns, 0)
+        _jumped(clock, exchanges, sent_ns, 0)
     before = estimate_of(clock)
     if clock.count == 0:
         _set_limits(clock, own)
@@ -356,11 +366,11 @@ def reply(
     newest.sent_ns, newest.rtt_ns, newest.offset_ns = middle, rtt, offset
     clock.count += 1
     if clock.doubts_in_a_row == SMALL_DOUBTS or (clock.doubts == DOUBTS and clock.doubted_ns > STAMPS_OFF_NS):
-        _jumped(clock, exchanges, ts1_ns, max(clock.doubts_in_a_row, DOUBTS))
+        _jumped(clock, exchanges, sent_ns, max(clock.doubts_in_a_row, DOUBTS))
     if clock.doubts == 0 and (clock.count <= _EVERY_SAMPLE or clock.count % _ESTIMATE_EVERY == 0):
         _estimate(clock, exchanges, middle)
     _stay_within_limits(clock, middle)
-    _measure_down(clock, tc1_ns, ts1_ns, rtt, before)
+    _measure_down(clock, tc1_ns, sent_ns, rtt, before)
     return rtt
 
 
@@ -597,7 +607,7 @@ class Clocks(NamedTuple):
     exchanges: Records
     """Of EXCHANGES, (n, WINDOW); the newest since the last jump, not in order."""
     pending_ns: NDArray[np.int64]
-    """ts1 of the requests without a reply, (n, most), oldest first."""
+    """ts1 of the requests without a reply, and when they were sent, (n, most, 2), oldest first."""
 
 
 def new_clocks(n: int) -> Clocks:
@@ -606,7 +616,7 @@ def new_clocks(n: int) -> Clocks:
     known["rtt_ns"] = known["down_ns"] = UNKNOWN
     known["newest_boot_ns"] = known["state_low_ns"] = known["fitted_ns"] = _LONG_AGO_NS
     known["ways_ns"], known["tilt"], known["since_ns"] = LATEST_NS, _TILT, -1
-    return Clocks(known, np.zeros((n, WINDOW), EXCHANGES), np.zeros((n, MOST_PENDING), np.int64))
+    return Clocks(known, np.zeros((n, WINDOW), EXCHANGES), np.zeros((n, MOST_PENDING, 2), np.int64))
 
 
 class VehicleClock:

@@ -17,7 +17,6 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Array, Records, int64, kernel
 from scenarios.networks import system_id_of
-from scenarios.sockets import Bytes, Ints
 
 STATION_SYSTEM_ID = 255
 STATION_COMPONENT_ID = 190
@@ -252,12 +251,6 @@ def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]
 def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
     """Fields of PARAM_REQUEST_READ, or of PARAM_EXT_REQUEST_READ, by name."""
     return (-1, target_system, 1, name.encode())
-
-
-def are_set_points(stream: Bytes, begins: Ints) -> NDArray[np.bool_]:
-    """Which frames of MAVLink 2, beginning at these places, are SET_POSITION_TARGET_LOCAL_NED."""
-    ids = stream[begins[:, None] + np.arange(7, 10)]
-    return (ids == (SET_POSITION_TARGET_LOCAL_NED, 0, 0)).all(axis=1)
 
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07

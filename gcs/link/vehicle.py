@@ -16,6 +16,7 @@ from gcs.link.clocks import (
     boot_ns_of,
     estimate_of,
     new_clocks,
+    note_sent,
     request,
     to_station_ns,
 )
@@ -117,6 +118,16 @@ def requests_to(links: Links, first: int, count: int, now_ns: int) -> Block:
     """TIMESYNC requests to so many vehicles in turn, from the `first` on, that have been heard."""
     frames, sizes, rows = _ask(links.known, links.clocks.known, links.clocks.pending_ns, first, count, now_ns)
     return Block(frames, sizes, rows, links.to)
+
+
+def note_requests(links: Links, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
+    """Note when the TIMESYNC requests among the datagrams of a step were sent: round trips count from then."""
+    place = 0
+    for part in outbox.parts:
+        count = len(part.rows) if isinstance(part, Block) else 1
+        if isinstance(part, Block) and count and part.frames[0, 7] == mavlink.TIMESYNC:
+            note_sent(links.clocks.known, links.clocks.pending_ns, part.rows, sent_ns[place : place + count])
+        place += count
 
 
 @kernel

@@ -21,7 +21,7 @@ from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Arrivals, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import SILENCE_S, RemoteVehicle, heartbeats_to, requests_to, set_points_to
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle, heartbeats_to, note_requests, requests_to, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
@@ -135,6 +135,10 @@ class Station:
             self._request_timesync(outgoing)
             self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
         return outgoing, None
+
+    def sent(self, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
+        """Note when each datagram of a step was sent, if that was later than the step."""
+        note_requests(self._fleet.links, outbox, sent_ns)
 
     def complete(self, tick: Tick, sent_ns: Sequence[int] | NDArray[np.int64]) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
