@@ -16,7 +16,7 @@ import numpy as np
 
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.link import mavlink
-from gcs.link.datagram import Address, Outgoing
+from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
@@ -204,6 +204,13 @@ class Watch:
             now_ns += 1
         self._note_request(now_ns, now_ns)
         return now_ns
+
+    def sent(self, datagrams: Iterable[Datagram]) -> None:
+        """Note when our own requests among these datagrams were sent."""
+        for data, _, sent_ns, _ in datagrams:
+            for frame in mavlink.decode(data, Counter()):
+                if frame.msg_id == mavlink.TIMESYNC:
+                    self._asked[frame.fields[1]] = sent_ns
 
     def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
         """Take in a frame of a vehicle or a station; returns its vehicle if it says something new."""

@@ -73,7 +73,7 @@ def watch_links(
                         recorder.note(frame, datagram.received_ns)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)
-            link.send(requests.due(watch, now_ns))
+            watch.sent(link.send(requests.due(watch, now_ns)))
             if now_ns >= show_ns:
                 show_ns = now_ns + period_ns
                 figures = report(_WINDOW_LOOKS)

@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from gcs.link.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
+from gcs.link.datagram import Outbox
+from gcs.link.vehicle import new_links, note_requests, requests_to
 from scenarios.schema import DRIFT_MAX_PPM, Clocks
 
 MS = 1_000_000
@@ -34,6 +36,20 @@ class Exchange:
 
     def bounded(self, time_ns: int) -> bool:
         return abs(self.error_ns(time_ns)) <= self.clock.estimate.bound_at_ns(time_ns)
+
+
+def test_round_trips_count_from_when_requests_were_sent() -> None:
+    addresses = [("here", port, 0) for port in range(3)]
+    links, outbox = new_links(3), Outbox()
+    links.to[:], links.known["address"] = addresses, range(3)
+    outbox.append((b"something else", addresses[0]))
+    outbox.add(requests_to(links, 0, 3, 7 * S))
+    note_requests(links, outbox, 7 * S + np.array([1, 2, 3, 4]) * MS)
+    for row in range(3):
+        clock = VehicleClock(links.clocks, row)
+        assert clock.reply(tc1_ns=5, ts1_ns=7 * S, received_ns=7 * S + 50 * MS) == (48 - row) * MS
+        assert clock.request(8 * S) == 8 * S
+        assert clock.reply(tc1_ns=S + 5, ts1_ns=8 * S, received_ns=8 * S + 50 * MS) == 50 * MS
 
 
 @pytest.mark.parametrize("one_way_ms", [0, 1, 20, 400, 2500])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from gcs.link import mavlink
+from gcs.link.datagram import Datagram
 from gcs.watch.links import SYSTEM_ID, Requests, Watch, WatchReport
 from gcs.watch.table import NOT_ASKED, links_table, render
 from scenarios.files import load
@@ -36,12 +37,12 @@ def linked(up: Link, down: Link) -> Scenario:
 class Watched:
     """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
 
-    def __init__(self, scenario: Scenario, *, timesync_hz: float, position_hz: float = 0.0) -> None:
+    def __init__(self, scenario: Scenario, *, timesync_hz: float, position_hz: float = 0.0, late_ns: int = 0) -> None:
         self.truth = MemoryRecorder()
         self.fleet = Fleet(scenario, START_NS, recorder=self.truth)
         self.watch = Watch()
         self.requests = Requests(timesync_hz, position_hz)
-        self.now_ns = START_NS
+        self.now_ns, self._late_ns = START_NS, late_ns
         self.sent: list[bytes] = []
         self.true_ages_s: list[float] = []
         """Of the first vehicle's newest state, at each look."""
@@ -67,7 +68,9 @@ class Watched:
                 self.true_ages_s += [self._true_age_s()] * (len(self.watch.vehicles[1].age_s) - looks)
             outgoing = self.requests.due(self.watch, self.now_ns)
             self.sent += [data for data, _ in outgoing]
-            to_vehicles = [(system_id, data, self.now_ns) for data, (_, system_id, _) in outgoing]
+            sent_ns = self.now_ns + self._late_ns
+            self.watch.sent(Datagram(data, address, sent_ns) for data, address in outgoing)
+            to_vehicles = [(system_id, data, sent_ns) for data, (_, system_id, _) in outgoing]
 
     def _true_age_s(self) -> float:
         boot_ms = self.watch.vehicles[1].boot_ns // MS
@@ -75,8 +78,10 @@ class Watched:
         return (self.now_ns - sampled[-1]) * 1e-9 if sampled else np.nan
 
 
-def test_round_trips_and_loop_delays_match_links_to_the_microsecond() -> None:
-    watched = Watched(linked(Link(delay_s=0.07), Link(delay_s=0.03)), timesync_hz=10.0)
+@pytest.mark.parametrize("late_ns", [0, MS // 2])
+def test_round_trips_and_loop_delays_match_links_to_the_microsecond(late_ns: int) -> None:
+    """Also if requests are sent later than they were made."""
+    watched = Watched(linked(Link(delay_s=0.07), Link(delay_s=0.03)), timesync_hz=10.0, late_ns=late_ns)
     watched.run(8.0)
     vehicle = watched.watch.vehicles[1]
     assert len(vehicle.rtt_s) > 60
