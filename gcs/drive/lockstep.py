@@ -21,6 +21,7 @@ from gcs.drive.guard import Guard
 from gcs.link import datagram
 from gcs.link.datagram import Address, Arrivals, Logged, Outbox
 from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.record import tlog_entries
 from gcs.station.station import Station
 from scenarios.kernel import Records
 from scenarios.keys.link import Links
@@ -41,7 +42,7 @@ _HOST = "virtual"
 _FLIGHTS_A_COLLECTION = 100
 """Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
 _flights = count(1)
-_TICKS_TO_PREPARE = 10
+_TICKS_TO_PREPARE, _STEPS_TO_PREPARE = 10, 20
 
 Sent = Datagrams | list[Datagram]
 """Datagrams from or to vehicles: arrays, or a list; iterated over, both give (system id, bytes, time in ns)."""
@@ -133,9 +134,13 @@ def prepare(plan: FlightPlan) -> None:
     station = Station(replace(plan, scenario=scenario, law=None, responses=None), start_ns=START_NS)
     flown, vehicles = 0, _Joining(vehicles_of(scenario))
     for _ in fly_lockstep(station.plan, station=station, vehicles=vehicles):
+        tlog_entries(station.frames)
         flown += station.phase is Phase.FLYING
         if flown == _TICKS_TO_PREPARE:
-            return
+            break
+    for _ in range(_STEPS_TO_PREPARE):
+        outbox, _ = station.step([], station.next_event_ns)
+        station.sent(outbox, np.zeros(len(outbox), np.int64))
 
 
 def fly_lockstep(

@@ -97,6 +97,8 @@ class StationSocket:
 
     def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
         self.guard, self.networks = guard, networks
+        self._reader, self._writer, self._addresses = Reader(), Writer(), _Addresses()
+        self._reader.read([])  # so that nothing is compiled in flight
         self._sockets = _bound(host, port, networks)
         self._descriptors = np.zeros(LAST_NETWORK + 1, np.int64)
         """By network."""
@@ -105,10 +107,9 @@ class StationSocket:
         self._networks = np.zeros(self._descriptors.max() + 1, np.int64)
         """By descriptor."""
         self._networks[self._descriptors[[*networks]]] = networks
-        self._reader, self._writer, self._addresses = Reader(), Writer(), _Addresses()
         self.bound_ns = self._woken_ns = clock_ns()
         self.send_errors = 0
-        self.send([])  # so that nothing is compiled in flight
+        self.send([])
 
     def __enter__(self) -> Self:
         return self

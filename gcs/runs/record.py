@@ -95,18 +95,8 @@ class RunWriter:
 
         `epoch_ns` is the instant, in ns since 1970, from which their times count.
         """
-        entries: dict[int, list[bytes]] = defaultdict(list)
-        for part in frames.parts:
-            if isinstance(part, Arrivals):
-                for network, table in _by_network(part).items():
-                    entry = np.empty(int((table[1] - table[0]).sum()) + _STAMP.size * table.shape[1], np.uint8)
-                    _fill(entry, part.stream, table, epoch_ns)
-                    entries[network].append(entry.tobytes())
-            else:
-                frame, time_ns, (_, _, network) = part
-                entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
-        for network, parts in entries.items():
-            self._add(tlog_file(network), b"".join(parts))
+        for network, entries in tlog_entries(frames, epoch_ns).items():
+            self._add(tlog_file(network), entries)
 
     def ended(self, name: str, error: OSError) -> None:
         """Note that a file of the run could not be written; it is left as it is from now on."""
@@ -128,6 +118,21 @@ class RunWriter:
             self._logs[name].add(data)
         except OSError as error:
             self.ended(name, error)
+
+
+def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
+    """The entries of frames in the telemetry log of each network."""
+    entries: dict[int, list[bytes]] = defaultdict(list)
+    for part in frames.parts:
+        if isinstance(part, Arrivals):
+            for network, table in _by_network(part).items():
+                own = np.empty(int((table[1] - table[0]).sum()) + _STAMP.size * table.shape[1], np.uint8)
+                _fill(own, part.stream, table, epoch_ns)
+                entries[network].append(own.tobytes())
+        else:
+            frame, time_ns, (_, _, network) = part
+            entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
+    return {network: b"".join(parts) for network, parts in entries.items()}
 
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:

@@ -17,7 +17,8 @@ from tests.support.paths import SCENARIOS
 def compiled():
     kernels = [each for each in gc.get_objects() if type(each).__name__ == "_Kernel" and each._compiled is not None]
     # in real time, the vehicles' run in a process of their own
-    return {each._name: len(each._compiled.signatures) for each in kernels if each._name.startswith("gcs.")}
+    ours = [each for each in kernels if each._name.startswith(("gcs.", "scenarios.sockets."))]
+    return {each._name: len(each._compiled.signatures) for each in ours}
 
 name, prediction = sys.argv[1:]
 scenario, lossy = load(SCENARIOS / f"{name}.toml"), Link(delay_s=0.05, loss_probability=0.1, duplicate_probability=0.1)
@@ -37,3 +38,29 @@ assert compiled() == before, {name: count for name, count in compiled().items() 
 @pytest.mark.parametrize(("name", "prediction"), [("triangle5", "off"), ("patrol", "measured"), ("copters5", "off")])
 def test_nothing_is_compiled_in_a_prepared_flight(name: str, prediction: str) -> None:
     subprocess.run([sys.executable, "-c", FLIGHT, name, prediction], check=True)
+
+
+IN_REAL_TIME = """
+import tempfile
+from pathlib import Path
+import gcs.drive.fly as real_time
+from gcs.drive.flown import margins_of
+from gcs.drive.udp import StationSocket
+
+def prepared(plan):
+    prepare(plan)
+    before.update(compiled())
+
+before, real_time.prepare = {}, prepared
+_, plan = flight_plan(load(SCENARIOS / "triangle5.toml").model_copy(update={"duration_s": 1.0}))
+with StationSocket("127.0.0.1", 0) as link, tempfile.TemporaryDirectory() as folder:
+    real_time.fly(plan, margins_of(plan), link, Path(folder), show_table=False)
+assert compiled() == before, {name: count for name, count in compiled().items() if before.get(name) != count}
+"""
+
+
+@pytest.mark.realtime
+@pytest.mark.xdist_group("realtime")
+def test_nothing_is_compiled_in_a_flight_in_real_time() -> None:
+    beginning = FLIGHT[: FLIGHT.index("name, prediction")]
+    subprocess.run([sys.executable, "-c", beginning + IN_REAL_TIME], check=True)
