@@ -95,22 +95,29 @@ def save_scenario(scenario: "Scenario", file: Path) -> None:
 
 def show_front(scenario: "Scenario", method: str | None, picture_file: Path | None, *, as_json: bool) -> None:
     """Search the front and print it."""
+    from gcs.interrupts import raised
     from gcs.studies.front import DELAYS_S, METHODS, front, picture
     from gcs.views.console import progress
 
-    if method == "graph-dk":
-        raise InputError("--method: read graph-dk, wanted inclusion or graph-lqr with --front or --at")
+    _refuse_graph_dk(scenario)
     if picture_file is not None:
         out_file("--picture", picture_file)
         if picture_file.suffix not in {".svg", ".png", ".pdf"}:
             raise InputError(f"--picture: read {picture_file}, wanted a file name that ends in .svg, .png or .pdf")
     wanted = method or ("inclusion" if scenario.response is not None else None)
     methods: Sequence[Method] = [own for own in METHODS if wanted in (None, own)]
-    with progress(shown=not as_json) as begin:
+    with raised(), progress(shown=not as_json) as begin:
         found = front(scenario, methods, DELAYS_S, workers=os.cpu_count() or 1, ended=begin("front"))
     if picture_file is not None:
         picture(found, picture_file)
     answer(found, _print_front, as_json=as_json)
+
+
+def _refuse_graph_dk(scenario: "Scenario") -> None:
+    """Refuse the method that searches no gains for a delay, whether the scenario or --method names it."""
+    if scenario.control.method == "graph-dk":
+        wanted = "--method inclusion or graph-lqr, with --front or --at"
+        raise InputError(f"{scenario.name}: read method graph-dk, wanted {wanted}")
 
 
 def _print_front(found: "FrontFields") -> None:
@@ -192,7 +199,6 @@ def scenario_at(
 
     within("--at", delay_s, 0.001, 10.0, "seconds")
     own: Method = "graph-lqr" if scenario.control.method == "graph-lqr" else "inclusion"
-    if scenario.control.method == "graph-dk":
-        raise InputError("--method: read graph-dk, wanted inclusion or graph-lqr with --front or --at")
+    _refuse_graph_dk(scenario)
     aim = "alpha_at_delay" if maximise == "alpha" else "decay_rate_at_delay_1_s"
     return point_at(scenario, delay_s, own, aim, predict)[0]

@@ -6,9 +6,10 @@ Each command imports what it needs when it runs: cvxpy, rerun and matplotlib are
 import gc
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.fly import fly, key
@@ -20,7 +21,19 @@ from gcs.cli.watch import monitor, replay
 from gcs.errors import InputError, extra_wanted
 from gcs.output import DISK_FULL
 
+
+class _Group(TyperGroup):
+    """Passes an interrupt on, of which Typer makes an exit without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+
+
 app = typer.Typer(
+    cls=_Group,
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

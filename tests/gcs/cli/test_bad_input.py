@@ -75,6 +75,17 @@ def test_what_cannot_be_used_is_refused_before_the_work(
     assert wanted in complaint(capsys, monkeypatch, *arguments.format(run=run).split())
 
 
+@pytest.mark.parametrize("options", ["--front", "--at 0.3", "--front --method graph-dk"])
+def test_the_method_that_searches_no_gains_for_a_delay_is_refused_there(
+    options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (FOLDER / "chain3_bidirectional.toml").read_text(encoding="utf-8")
+    file = tmp_path / "dk.toml"
+    file.write_text(text if "--method" in options else text.replace('"graph-lqr"', '"graph-dk"'), encoding="utf-8")
+    line = complaint(capsys, monkeypatch, "design", str(file), *options.split())
+    assert "read method graph-dk, wanted --method inclusion or graph-lqr, with --front or --at" in line
+
+
 @pytest.mark.parametrize(
     "command", ["fly", "fly --virtual", "check", "design", "stress --onset", "compare", "capacity"]
 )
@@ -196,7 +207,7 @@ def test_a_picture_is_a_png_within_the_recording(
 def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
     scenario = line(2)
-    summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100), [])
+    summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100).ravel(), [])
     reason = "refused: give [response] in [/the scenario] :warning:"
     print_summary(summary.model_copy(update={"reason": reason}), Path("[bold]"))
     told = capsys.readouterr().out

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from tests.support.paths import ROOT
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 STRESS = ["stress", "scenarios/chain3.toml", "--delay", "0.1:0.3:3", "--workers", "2", "--out"]
+FRONT = ["design", "scenarios/chain3.toml", "--front"]
 FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
 
 
@@ -35,7 +37,20 @@ FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
 def test_a_signal_while_workers_import_is_no_traceback(
     arguments: list[str], module: str, times: int, number: signal.Signals, tmp_path: Path
 ) -> None:
-    command = [sys.executable, "-m", "gcs", *arguments, str(tmp_path / "out")]
+    told = ended([*arguments, str(tmp_path / "out")], module, times, lambda process: os.killpg(process.pid, number))
+    assert "Traceback" not in told
+    assert "KeyboardInterrupt" not in told
+
+
+def test_a_front_that_is_interrupted_leaks_no_semaphores() -> None:
+    told = ended(FRONT, "numpy", 2, lambda process: process.send_signal(signal.SIGINT))
+    lines = [line for line in told.splitlines() if not line.startswith("import time:")]
+    assert lines == ["interrupted"]
+
+
+def ended(arguments: list[str], module: str, times: int, end: Callable[["subprocess.Popen[str]"], None]) -> str:
+    """What a command says that is ended, with code 130, when a module has been imported so many times."""
+    command = [sys.executable, "-m", "gcs", *arguments]
     environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}  # each process tells what it has imported
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT, env=environment,
@@ -47,9 +62,8 @@ def test_a_signal_while_workers_import_is_no_traceback(
             seen += line.split("|")[-1].strip() == module
             if seen == times:
                 break
-        os.killpg(process.pid, number)
+        end(process)
         told = process.stderr.read()
         code = process.wait(60)
     assert (seen, code) == (times, 130)
-    assert "Traceback" not in told
-    assert "KeyboardInterrupt" not in told
+    return told
