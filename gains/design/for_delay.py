@@ -257,8 +257,8 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None
     """Return the point of a family that meets a requirement with criteria and is best in its objective, with figures.
 
     `evaluations` is how many gains are compared; None: more, the more free entries they have. InfeasibleError if none
-    was found that meets the requirement; its message says how far each part alone, or several together, have to be
-    relaxed. Whoever asks for exactly that gets gains: those by which the message was found are found again.
+    was found that is stable and meets the requirement; its message says how far each part alone, or several together,
+    have to be relaxed. Whoever asks for exactly that gets gains: those by which the message was found are found again.
     """
     assert wanted.criteria is not None
     objective = wanted.criteria.objective or ("alpha" if wanted.delay_margin_s is not None else "delay_margin_s")
@@ -268,15 +268,17 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None
         return -float(getattr(figures, objective))
 
     found = _best(family, parts, cost, family.starts, evaluations)
+    if _meets(found[1], parts):
+        return found
     most: list[Reached] = []
-    for part in parts if not _meets(found[1], parts) else ():
+    for part in parts:
         most.append(_most(family, part, parts, evaluations))
         if _meets(most[-1][1], parts):
             better = _best(family, parts, cost, [most[-1][0]], evaluations)
             return better if _meets(better[1], parts) else most[-1]
-    if most:
-        raise InfeasibleError(_refusal(family, parts, most, found[1]))
-    return found
+    if not parts:
+        raise InfeasibleError(f"found no stable gains at at_delay_s = {wanted.criteria.at_delay_s}; try a shorter one")
+    raise InfeasibleError(_refusal(family, parts, most, found[1]))
 
 
 def _refusal(family: GainFamily, parts: Sequence[Part], most: Sequence[Reached], nearest: Figures) -> str:

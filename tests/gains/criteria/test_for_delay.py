@@ -145,6 +145,13 @@ def test_best_decay_at_a_delay_is_the_triple_root() -> None:
     assert -growth_rate(PAIR.A, PAIR.B, K, period_s=PERIOD_S, delay_s=0.3) == pytest.approx(decay, rel=0.1)
 
 
+def test_where_nothing_is_stable_a_search_without_requirements_finds_nothing() -> None:
+    """The vehicle's own velocity loop, s (s² / ω² + lag s + 1) + g, is stable if lag > g / ω²."""
+    unstable = Response(lag_s=0.1, velocity_gain_1_s=10.0, natural_frequency_rad_s=5.0)
+    with pytest.raises(InfeasibleError, match=r"found no stable gains at at_delay_s = 0\.3; try"):
+        criteria_gains(Requirement(criteria=Criteria(at_delay_s=0.3)), PERIOD_S, unstable)
+
+
 @pytest.mark.parametrize("decay_1_s", [0.6, 0.96, 1.2])
 def test_no_static_gains_of_lagging_vehicles_decay_faster(decay_1_s: float) -> None:
     """Second way: the simplex method, over the roots of the continuous loop, finds none at a delay 5 % longer."""
