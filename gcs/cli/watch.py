@@ -10,11 +10,13 @@ import typer
 from gcs.cli import FAILED, INTERRUPTED, options
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+from scenarios.networks import networks_of
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
     from gcs.watch.rebuild_report import RebuildReport
     from gcs.watch.saved_links import LinkRecorder
+    from scenarios.schema import Scenario
 
 _TIMESYNC_HZ = _POSITION_HZ = 10.0
 SavedLinks = Annotated[
@@ -51,6 +53,8 @@ def monitor(
 ) -> None:
     """Watch latencies against a margin, commanding nothing.
 
+    It watches the ports of all networks of SCENARIO; without one, a single port.
+
     The monitor sends only TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. It
     sends no heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without
     any exchange, delays are measured against the fastest frames, which makes them lower bounds.
@@ -67,10 +71,9 @@ def monitor(
         options.out_file("--save-links", save_links)
     if sys.stdout.isatty():  # a closed one sends a signal; a reader that closes its pipe must still end the command
         outlive_readers()
-    with options.listening("--listen", listen, options.opened_guard(key, role="monitor")) as link:
-        # the formation is all that is needed of a scenario whose margin is given
-        code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
-        scenario = None if scenario_file is None else options.load_scenario(scenario_file, allow_code=code_allowed)
+    scenario = None if scenario_file is None else _formation(scenario_file, given)
+    networks = [0] if scenario is None else networks_of(vehicle.system_id for vehicle in scenario.vehicles)
+    with options.listening("--listen", listen, options.opened_guard(key, role="monitor"), networks) as link:
         if scenario is not None and given is None:
             from gcs.plan.planner import flight_plan
 
@@ -129,7 +132,8 @@ def replay(
 
     Round trips come from the TIMESYNC exchanges in the log. Without them, delays are measured against the fastest
     frames, which makes them lower bounds. Spacing errors need the formation, from the run's folder or from SCENARIO.
-    Damaged parts of the log are left out and counted.
+    Formations of several networks are refused, as a log does not name its network. Damaged parts of the log are left
+    out and counted.
     """
     given, _ = _given(margin, design)
     from gcs.watch.rebuild_report import found, rebuild_report
@@ -140,8 +144,10 @@ def replay(
     there = found(run)
     log = read_tlog(there.log_file)
     if scenario_file is not None:
-        code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
-        scenario = options.load_scenario(scenario_file, allow_code=code_allowed)
+        scenario = _formation(scenario_file, given)
+        if (networks := networks_of(vehicle.system_id for vehicle in scenario.vehicles)) != [0]:
+            read = f"vehicles in the networks {' '.join(map(str, networks))}"
+            raise InputError(f"{scenario_file}: read {read}, wanted network 0 alone: a log does not name its network")
         there = replace(there, scenario=scenario, design=None, recorded=None)
     if given is not None:
         there = replace(there, design=given)
@@ -154,6 +160,12 @@ def replay(
         from gcs.watch.saved_links import recorded
 
         _save(save_links, recorded(log.frames), f"gcs replay of {there.log_file.name}", shown=not as_json)
+
+
+def _formation(scenario_file: Path, given: "Design | None") -> "Scenario":
+    """The scenario; of one whose margin is given no code is run, as the formation is all that is needed of it."""
+    code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
+    return options.load_scenario(scenario_file, allow_code=code_allowed)
 
 
 def _save(file: Path, recorder: "LinkRecorder", source: str, *, shown: bool) -> None:

@@ -23,10 +23,14 @@ from scenarios.files import dump, load, parse
 from scenarios.networks import ids_of, networks_of
 from scenarios.schema import Scenario
 from scenarios.signing.keys import KEY_BYTES, Key
+from tests.support.fleets.logged_flight import log_bytes
 from tests.support.paths import SCENARIOS
 
 IDS = {1: 1, 2: 2, 3: 1001, 4: 1002, 5: 9002}
 """Vehicles 1 and 2 of networks 0 and 1, and a vehicle 2 of network 9."""
+_OWN: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
+HEARTBEAT: bytes = _OWN.heartbeat_encode(2, 3, 1, 0, 3).pack(_OWN)
+"""Of a vehicle 2."""
 
 
 def renumbered(duration_s: float, **changes: Any) -> Scenario:
@@ -77,10 +81,8 @@ def test_a_signed_flight_in_networks_is_the_unsigned_one() -> None:
 
 def test_a_vehicle_is_heard_in_its_own_network_only() -> None:
     station = Station(planned(renumbered(2.0)), start_ns=START_NS)
-    own: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
-    heartbeat = own.heartbeat_encode(2, 3, 1, 0, 3).pack(own)
     for network in (0, 1, 2, 9):
-        station.step([Datagram(heartbeat, ("127.0.0.1", 7000 + network, network), START_NS)], START_NS)
+        station.step([Datagram(HEARTBEAT, ("127.0.0.1", 7000 + network, network), START_NS)], START_NS)
     heard = {vehicle.system_id: vehicle.address for vehicle in station.vehicles if vehicle.address is not None}
     assert heard == {2: ("127.0.0.1", 7000, 0), 1002: ("127.0.0.1", 7001, 1), 9002: ("127.0.0.1", 7009, 9)}
     assert station.counters == {"unknown system id": 1}
@@ -107,6 +109,10 @@ def test_the_benchmarks_formation_fills_one_network_after_the_other() -> None:
     [
         ("fly networks.toml --mirror 127.0.0.1:9", "--mirror: read vehicles in the networks 0 1 9, wanted one"),
         ("fly networks.toml --listen 127.0.0.1:65530", "there is no port 65539 for network 9, wanted free UDP ports"),
+        (
+            "replay flight-1.tlog networks.toml",
+            "networks.toml: read vehicles in the networks 0 1 9, wanted network 0",
+        ),
         ("fly wrong.toml", "vehicle 1251: system_id (line 17): read 1251, wanted at most 250, or 1001 to 1250 in"),
     ],
 )
@@ -115,6 +121,7 @@ def test_what_networks_cannot_do_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("networks.toml").write_text(dump(renumbered(2.0)))
+    Path("flight-1.tlog").write_bytes(log_bytes([(0, HEARTBEAT)]))
     text = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
     Path("wrong.toml").write_text(text.replace("system_id = 1\n", "system_id = 1251\n"))
     monkeypatch.setattr("sys.argv", ["gcs", *arguments.split()])

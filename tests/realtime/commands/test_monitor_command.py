@@ -8,12 +8,13 @@ import sys
 from collections import Counter
 from collections.abc import Generator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.link import mavlink
-from tests.support.paths import ROOT
+from tests.support.paths import ROOT, SCENARIOS
 from tests.support.processes import PATIENCE_S
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
@@ -32,9 +33,9 @@ def monitor(*arguments: str) -> "subprocess.Popen[str]":
 
 
 @contextmanager
-def vehicles(address: str) -> Generator[None]:
-    """The vehicles of chain3, 20 ms each way."""
-    command = [sys.executable, "-m", "sim_vehicles.drive.cli", "scenarios/chain3.toml", "--station", address]
+def vehicles(address: str, scenario: str = "scenarios/chain3.toml") -> Generator[None]:
+    """The vehicles of a scenario; those of chain3 have links of 20 ms each way."""
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", scenario, "--station", address]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT) as process:
         try:
             yield
@@ -55,6 +56,20 @@ def test_links_are_watched_and_compared_with_the_scenarios_margin() -> None:
         assert vehicle["rtt_s"]["p50"] == pytest.approx(0.04, abs=0.003)
         assert vehicle["clock"]["bound_s"] == pytest.approx(0.02, abs=0.002)
         assert vehicle["headroom"] == pytest.approx(1 - vehicle["loop_delay_s"]["p99"] / report["delay_margin_s"])
+
+
+def test_vehicles_of_all_networks_are_watched(tmp_path: Path) -> None:
+    text = (SCENARIOS / "chain3.toml").read_text(encoding="utf-8")
+    for before, after in {"system_id = 2": "system_id = 1001", "follows = 2": "follows = 1001"}.items():
+        text = text.replace(before, after)
+    (tmp_path / "two.toml").write_text(text, encoding="utf-8")
+    address, scenario = free_address(), str(tmp_path / "two.toml")
+    with vehicles(address, scenario):
+        process = monitor(scenario, "--listen", address, "--for", "4", "--json")
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (0, "")
+    seen = {vehicle["system_id"]: vehicle["status"] for vehicle in json.loads(out)["vehicles"]}
+    assert seen == dict.fromkeys((1, 3, 1001), "measured")
 
 
 def test_ctrl_c_prints_the_figures_and_what_was_sent() -> None:
