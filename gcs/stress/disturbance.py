@@ -189,20 +189,20 @@ def _onset(
             size = max(0.0, middle + part * width)
             points += _flown(plan, case.scenario(probe, size, duration_s=duration_s), size)
             ended()
-        zero = locate_zero([point for point in points if abs(point.loop_delay_s - middle) <= 1.001 * width])
+        zero = locate_zero([point for point in points if abs(point.varied - middle) <= 1.001 * width])
         if zero is not None and zero.inside:
             break
         # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
         middle += _way(zero, points, middle, width)
     inside = zero if zero is not None and zero.inside else None
-    onset = None if inside is None else inside.loop_delay_s
+    onset = None if inside is None else inside.varied
     return DisturbanceOnset(
         kind=case.kind,
         vehicles=case.vehicles,
         radius_1_s=radius,
         frequency_rad_s=omega,
         onset_1_s=onset,
-        error_1_s=None if inside is None else inside.error_s,
+        error_1_s=None if inside is None else inside.error,
         difference=None if onset is None else onset / radius - 1.0,
         flights=len(points),
     )
@@ -211,12 +211,12 @@ def _onset(
 def _way(zero: Zero | None, points: Sequence[GrowthPoint], middle: float, width: float) -> float:
     """How far to the next middle: to where growth seems to pass zero, three widths at most."""
     if zero is not None:
-        return float(np.clip(zero.loop_delay_s - middle, -3.0 * width, 3.0 * width))
+        return float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
     return -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:
-    """The growth measured in one flight; `GrowthPoint.loop_delay_s` is the size here. Empty if nothing was measured."""
+    """The growth measured in one flight with a disturbance of a size. Empty if nothing was measured."""
     flight, ids = fly_plan(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)

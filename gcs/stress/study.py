@@ -161,9 +161,9 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
             all_grow = min((o.growth_1_s for o in near if o.growth_1_s is not None), default=0.0) > 0.0
             centre_s, width_s = centre_s + way * (-width_s if all_grow else width_s), 2.0 * width_s
             continue
-        zero = replace(zero, loop_delay_s=way * zero.loop_delay_s)
+        zero = replace(zero, varied=way * zero.varied)
         waiting_s = _waiting_s(near)
-        ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
+        ahead_s = max(0.0, zero.varied - waiting_s) - centre_s
         wanted_s = tolerance * expected_s
         close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
         if zero.inside and close and width_s <= 1.001 * wanted_s:
@@ -235,7 +235,7 @@ def _found(
     shorter: bool,
 ) -> Onset:
     blocks = plan_loops(study.plan)
-    nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.loop_delay_s))
+    nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.varied))
     assert nearest.probed is not None
     assert nearest.critical is not None
     block = next(block for block in blocks if nearest.probed in block.system_ids)
@@ -245,7 +245,7 @@ def _found(
     own_s = block.loop.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
     waiting_s = _waiting_s(near)
-    link_s = max(0.0, zero.loop_delay_s - waiting_s)
+    link_s = max(0.0, zero.varied - waiting_s)
     seed = study.plan.scenario.seed
     at_onset = {"delay": round(link_s, 6)}
     others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]
@@ -256,14 +256,14 @@ def _found(
     beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
     own = run([study.trial("own", {"delay": delay_s}, seed=seed) for delay_s in beside_s])
     return Onset(
-        loop_delay_s=zero.loop_delay_s,
-        error_s=zero.error_s,
+        loop_delay_s=zero.varied,
+        error_s=zero.error,
         predicted_s=None if np.isnan(predicted_s) else predicted_s,
         predicted_continuous_s=block.loop.window_continuous_s()[end] if is_modelled(study.plan) else None,
-        difference=None if np.isnan(predicted_s) else zero.loop_delay_s / predicted_s - 1.0,
+        difference=None if np.isnan(predicted_s) else zero.varied / predicted_s - 1.0,
         link_delay_s=link_s,
         waiting_s=waiting_s,
-        slope_1_s2=zero.slope_1_s2,
+        slope_1_s2=zero.slope,
         frequency_rad_s=_median([o.frequency_rad_s for o in near if o.frequency_rad_s is not None]),
         probed=nearest.probed,
         critical=nearest.critical,

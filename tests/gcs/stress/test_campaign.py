@@ -205,7 +205,8 @@ class cluster:  # noqa: N801 - used as a function
         file = self.folder / "scheduler.json"
         place = ["--scheduler-file", str(file)]
         quiet = ["--no-dashboard", "--interface", "lo"]
-        self._start("distributed.cli.dask_scheduler", *place, *quiet, "--port", "0")
+        free = ["--port", "0", "--dashboard-address", "127.0.0.1:0"]  # of its HTTP server, with no dashboard too
+        self._start("distributed.cli.dask_scheduler", *place, *quiet, *free)
         self._start(
             "distributed.cli.dask_worker", *place, *quiet, "--nthreads", "1", "--local-directory", str(self.folder)
         )

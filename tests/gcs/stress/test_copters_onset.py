@@ -59,7 +59,7 @@ def onset_of(plan: FlightPlan, *, within_1_s: float) -> float:
     zero = locate_zero(points)
     assert zero is not None
     assert zero.inside
-    return zero.loop_delay_s
+    return zero.varied
 
 
 def test_vehicles_that_never_become_ready_are_refused_in_one_line() -> None:
