@@ -97,8 +97,10 @@ def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
         from distributed import LocalCluster
     except ImportError:
         raise InputError("--cluster: the package distributed is not installed, wanted the extra [cluster]") from None
-    make: Any = LocalCluster  # its types allow neither no dashboard nor a cluster that is there at once
-    with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+    make: Any = LocalCluster  # its types allow no cluster that is there at once
+    # without a port its HTTP server, which also runs without a dashboard, takes 8787, and warns if that is in use
+    http = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", scheduler_kwargs=http) as cluster:
         with dask_workers(cluster.scheduler_address, _not_flown) as answer:
             list(answer(unflown[:1]))  # the workers' imports
             used_s = time.process_time()
