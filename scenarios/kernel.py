@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
@@ -27,14 +27,24 @@ int64: Any = np.int64
 
 
 def kernel(function: F) -> F:
-    """The function, compiled when it is first called. It must raise nothing: a datagram may hold anything."""
-    compiled: Any = _Kernel(function)
+    """The function, compiled when it is first called. It must raise nothing: a datagram may hold anything.
+
+    It makes no arrays, so references to arrays are not counted, which would take most of its time.
+    """
+    compiled: Any = _Kernel(function, makes_arrays=False)
+    return compiled
+
+
+def array_kernel(function: F) -> F:
+    """The same of a function that makes arrays, or calls one that returns new ones."""
+    compiled: Any = _Kernel(function, makes_arrays=True)
     return compiled
 
 
 class _Kernel:
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], *, makes_arrays: bool) -> None:
         self._function = function
+        self._makes_arrays = makes_arrays
         self._name = f"{function.__module__}.{function.__qualname__}"
         self.__doc__ = function.__doc__
         self._compiled: Callable[..., Any] | None = None
@@ -49,18 +59,33 @@ class _Kernel:
         return compiled._numba_type_
 
     def _compile(self) -> Callable[..., Any]:
-        from numba import njit
+        import numba
         from numba.core import config
 
+        self._refuse_lost_arrays()
         settings: Any = config
+        compiler: Any = numba
         folder, before = _cache(settings.CACHE_DIR), settings.CACHE_DIR
         # an index of its own for each state of the source: Numba's does not see what a kernel calls
-        settings.CACHE_DIR = "" if folder is None else str(folder / f"{self._stamp}-{settings.BOUNDSCHECK}")
+        settings.CACHE_DIR = (
+            "" if folder is None else str(folder / f"{self._stamp}-{settings.BOUNDSCHECK}{self._makes_arrays:d}")
+        )
         try:
-            self._compiled = compiled = njit(cache=folder is not None)(self._function)
+            self._compiled = compiled = compiler.njit(cache=folder is not None, _nrt=self._makes_arrays)(self._function)
         finally:
             settings.CACHE_DIR = before
         return compiled
+
+    def _refuse_lost_arrays(self) -> None:
+        """Raise TypeError if arrays are returned to a kernel that counts no references: they would never be freed."""
+        for called in () if self._makes_arrays else self._called():
+            returned = get_type_hints(called._function)["return"]
+            if called._makes_arrays and not {*(get_args(returned) or (returned,))} <= {type(None), bool, int, float}:
+                raise TypeError(f"{self._name} calls {called._name}, which returns arrays, so it is an array_kernel")
+
+    def _called(self) -> "list[_Kernel]":
+        names, known = self._function.__code__.co_names, self._function.__globals__
+        return [known[name] for name in names if isinstance(known.get(name), _Kernel)]
 
     @cached_property
     def _stamp(self) -> str:
@@ -71,11 +96,10 @@ class _Kernel:
             one = left.pop()
             function = one._function
             reached[one._name] = Path(function.__code__.co_filename).read_bytes()
+            left += [called for called in one._called() if called._name not in reached]
             for name in function.__code__.co_names:
                 value = function.__globals__.get(name)
-                if isinstance(value, _Kernel):
-                    left += [] if value._name in reached else [value]
-                elif isinstance(value, bool | int | float | tuple):
+                if isinstance(value, bool | int | float | tuple):
                     reached[f"{function.__module__}.{name}"] = repr(value).encode()
         parts = [self._name.encode(), *(name.encode() + reached[name] for name in sorted(reached))]
         return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]

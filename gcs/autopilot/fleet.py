@@ -32,6 +32,7 @@ class AutopilotFleet:
 
     speaks_mavlink_1_first = True
     holds_when_left_alone = False
+    is_usual = False
 
     def __init__(self, plan: FlightPlan, report: Report) -> None:
         scenario, ids = plan.scenario, plan.formation.system_ids

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from scenarios.kernel import Records, kernel
+from scenarios.kernel import Records, array_kernel, kernel
 
 State = tuple[float, float, float, float]
 """Position north and east in m, velocity north and east in m/s."""
@@ -89,14 +89,14 @@ class StateHistory:
         return self._times_ns[vehicle, k], (north, east, v_north, v_east)
 
     def every_newest(self) -> tuple[Instants, FloatArray]:
-        return _every_newest(self.reports, self.counts)
+        return every_newest(self.reports, self.counts)
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing. See `state_at`."""
         return state_at(self.reports, self.counts, vehicle, time_ns) if self.counts[vehicle] else None
 
     def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
-        return _every_at(self.reports, self.counts, vehicles, times_ns)
+        return every_at(self.reports, self.counts, vehicles, times_ns)
 
 
 @kernel
@@ -153,8 +153,8 @@ def _between(a_ns: int, a: FloatArray, b_ns: int, b: FloatArray, time_ns: int) -
     )
 
 
-@kernel
-def _every_newest(reports: Records, counts: NDArray[np.int64]) -> tuple[Instants, FloatArray]:
+@array_kernel
+def every_newest(reports: Records, counts: NDArray[np.int64]) -> tuple[Instants, FloatArray]:
     times_ns, states = np.zeros(len(counts), np.int64), np.full((len(counts), 4), nan)
     for row in range(len(counts)):
         if counts[row]:
@@ -165,8 +165,8 @@ def _every_newest(reports: Records, counts: NDArray[np.int64]) -> tuple[Instants
     return times_ns, states
 
 
-@kernel
-def _every_at(
+@array_kernel
+def every_at(
     reports: Records, counts: NDArray[np.int64], vehicles: NDArray[np.int64], times_ns: Instants
 ) -> FloatArray:
     states = np.full((len(vehicles), 4), nan)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gcs.control.history import Instants, Reports, States
 from gcs.plan.formation import Formation
-from scenarios.kernel import Array, Records, kernel
+from scenarios.kernel import Array, Records, array_kernel
 
 Gain = tuple[float, float, float, float, float, float, float, float]
 """A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""
@@ -192,7 +192,7 @@ def formation_control(
     times_ns, states = history.every_newest()
     controls = np.empty(len(times_ns), CONTROL)
     seen = history.every_at(law.packed.source, times_ns.take(law.packed.to))
-    _control(controls, law.packed, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
+    control_all(controls, law.packed, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
     return controls
 
 
@@ -222,12 +222,12 @@ def commands_of(
 ) -> FloatArray:
     """The same from the vehicles' own states (n, 4) and those that the terms of their laws use (m, 4)."""
     controls = np.empty(len(own), CONTROL)
-    _control(controls, law.packed, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
+    control_all(controls, law.packed, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
     return controls["command_m_s2"]
 
 
-@kernel
-def _control(
+@array_kernel
+def control_all(
     controls: Records, law: PackedLaw, times_ns: Array, states: Array, seen: Array, blends: Records,
     nominal_north: float, nominal_east: float, opening: float,
 ) -> None:  # fmt: skip
@@ -276,15 +276,15 @@ def nearest(controls: Records, now_ns: int, down_m: FloatArray | None = None) ->
     `down_m` holds the vehicles' positions down if they fly at different altitudes; without it, distances are
     horizontal.
     """
-    return Nearest(*_nearest(controls, now_ns, np.empty(0) if down_m is None else down_m))
+    return Nearest(*nearest_of(controls, now_ns, np.empty(0) if down_m is None else down_m))
 
 
 _ROUNDED_UP = 1.0 + 1e-9
 """A distance is not larger than this times one that is computed otherwise, whatever was rounded."""
 
 
-@kernel
-def _nearest(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
+@array_kernel
+def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
     """See `nearest`; `down_m` is empty if it does not matter."""
     n = len(controls)
     north, east, near = np.empty(n), np.empty(n), np.full(n, inf)

@@ -1,9 +1,9 @@
 """The scenario's limits, applied to every set-point that is sent, whatever computed it."""
 
 from dataclasses import dataclass
-from math import hypot
 
 from gains.core.arrays import FloatArray
+from scenarios.hypot import hypot
 from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import Limits
 
@@ -25,20 +25,22 @@ class SetPointLimits:
 
     def limit_commands(self, commands_m_s2: FloatArray) -> None:
         """Shorten accelerations (n, 2) to the limit, each in its own direction."""
-        _shorten(commands_m_s2, self.acceleration_m_s2)
+        shorten(commands_m_s2, self.acceleration_m_s2)
 
     def limit(self, points: Records) -> None:
         """Shorten the velocities and accelerations of set-points (n, SET_POINT) to the limits."""
-        _shorten(points["velocity_ned_m_s"][:, :2], self.speed_m_s)
-        _shorten(points["acceleration_ne_m_s2"], self.acceleration_m_s2)
+        shorten(points["velocity_ned_m_s"], self.speed_m_s)
+        shorten(points["acceleration_ne_m_s2"], self.acceleration_m_s2)
 
 
-def _shorten(vectors: FloatArray, longest: float) -> None:
-    if any_beyond(vectors, 0.7 * longest):  # one of them may be longer
-        for row, (north, east) in enumerate(vectors.tolist()):
-            size = hypot(north, east)
-            if size > longest:
-                vectors[row] = north * longest / size, east * longest / size
+@kernel
+def shorten(vectors: Array, longest: float) -> None:
+    """Shorten the horizontal parts of vectors (n, 2 or 3) to a length, each in its own direction."""
+    for row in range(len(vectors)):
+        north, east = vectors[row, 0], vectors[row, 1]
+        size = hypot(north, east)
+        if size > longest:
+            vectors[row, 0], vectors[row, 1] = north * longest / size, east * longest / size
 
 
 @kernel

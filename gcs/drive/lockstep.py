@@ -18,6 +18,7 @@ import numpy as np
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.guard import Guard
+from gcs.drive.usual_steps import UsualSteps
 from gcs.link import datagram
 from gcs.link.datagram import Address, Arrivals, Logged, Outbox
 from gcs.plan.flight_plan import FlightPlan
@@ -43,6 +44,8 @@ _FLIGHTS_A_COLLECTION = 100
 """Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
 _flights = count(1)
 _TICKS_TO_PREPARE, _STEPS_TO_PREPARE = 10, 20
+_MOST_USUAL = 100
+"""Of more vehicles, one does something unusual in most steps."""
 
 Sent = Datagrams | list[Datagram]
 """Datagrams from or to vehicles: arrays, or a list; iterated over, both give (system id, bytes, time in ns)."""
@@ -167,36 +170,42 @@ class _Bridge:
 
     def __init__(self, system_ids: Sequence[int]) -> None:
         self._ids = sorted(system_ids)
-        self._addresses: list[Address] = [(_HOST, key, network_of(key)) for key in self._ids]
-        self._row = {address: row for row, address in enumerate(self._addresses)}
-        self._rows = np.array([self._ids.index(key) for key in system_ids])
+        self.addresses: list[Address] = [(_HOST, key, network_of(key)) for key in self._ids]
+        self._row = {address: row for row, address in enumerate(self.addresses)}
+        self.rows = np.array([self._ids.index(key) for key in system_ids])
         """Those of the station's vehicles."""
 
     def arrivals(self, sent: Datagrams) -> Arrivals:
-        return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self._addresses)
+        return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self.addresses)
 
     def one_by_one(self, sent: Sent) -> list[datagram.Datagram]:
         return [datagram.Datagram(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
 
     def to_vehicles(self, outgoing: Outbox, now_ns: int) -> Datagrams:
-        stream, table = outgoing.packed(self._row.__getitem__, lambda _: self._rows)
+        stream, table = outgoing.packed(self._row.__getitem__, lambda _: self.rows)
         table[3] = now_ns
         return Datagrams(stream, table, self._ids)
 
 
 def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:
     bridge = _Bridge(plan.formation.system_ids)
-    to_vehicles: Sent = []
+    to_vehicles: Sent = bridge.to_vehicles(Outbox(), START_NS)
+    plain = guard is None and station.is_usual and len(station.vehicles) <= _MOST_USUAL
+    fleet = vehicles if plain and isinstance(vehicles, Fleet) else None
+    usual = None if fleet is None else UsualSteps(station, fleet, bridge.addresses, bridge.rows)
     while station.phase is not Phase.ENDED:
-        now_ns = station.next_event_ns
-        arrived = vehicles.step(to_vehicles, now_ns)
+        if usual is not None and fleet is not None and fleet.is_usual and isinstance(to_vehicles, Datagrams):
+            now_ns, arrived, taken = yield from usual.fly(to_vehicles)
+        else:
+            now_ns, taken = station.next_event_ns, 0
+            arrived = vehicles.step(to_vehicles, now_ns)
         if guard is not None:
             datagrams = guard.received(bridge.one_by_one(arrived), now_ns, station.counters, station.is_another)
             outgoing, tick = station.step(datagrams, now_ns)
             to_vehicles = [(key, data, now_ns) for data, (_, key, _) in guard.sent(outgoing, now_ns)]
         else:
             arrivals = bridge.arrivals(arrived) if isinstance(arrived, Datagrams) else bridge.one_by_one(arrived)
-            outgoing, tick = station.step(arrivals, now_ns)
+            outgoing, tick = station.step(arrivals, now_ns, taken)
             to_vehicles = bridge.to_vehicles(outgoing, now_ns)
         if tick is not None:
             yield station.complete(tick, np.full(len(outgoing), now_ns))

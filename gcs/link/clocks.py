@@ -45,7 +45,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
+from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, kernel
 from scenarios.schema import DRIFT_MAX_PPM
 
 WINDOW = 128
@@ -462,7 +462,7 @@ def _is_doubtful(clock: Record, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns:
     return False
 
 
-@kernel
+@array_kernel
 def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
     """Start over with the newest exchanges.
 
@@ -501,7 +501,7 @@ def _stay_within_limits(clock: Record, at_ns: int) -> None:
     clock.samples, clock.offset_ns, clock.reference_ns = min(clock.count, WINDOW), offset_ns, at_ns
 
 
-@kernel
+@array_kernel
 def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
     """Fit the line to the exchanges of the window."""
     n, known, ageing = min(clock.count, WINDOW), estimate_of(clock), clock.tilt
@@ -548,7 +548,7 @@ def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
     _set_estimate(clock, ClockEstimate(n, base + round(offset_ns), skew, 0, now_ns))
 
 
-@kernel
+@array_kernel
 def _quickest(t: _Floats, y: _Floats, rtt: _Floats, skew: float, ageing: float) -> tuple[float, float]:
     """Limits of the offset at t = 0 by the quickest way up and the quickest down; they worsen with age."""
     offset, way, aged = y - skew * t, (0.5 + 0.5 * skew) * rtt, ageing * t

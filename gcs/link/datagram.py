@@ -79,7 +79,8 @@ class Frames:
 
     def add(self, arrivals: Arrivals, first: int = 0, stop: int | None = None) -> None:
         """Add the datagrams from the place `first` up to `stop`, each of one frame."""
-        self.parts.append(replace(arrivals, table=arrivals.table[:, first:stop]))
+        some = first or stop is not None
+        self.parts.append(replace(arrivals, table=arrivals.table[:, first:stop]) if some else arrivals)
 
     def take(self, other: "Frames") -> None:
         """Add all frames of another, which has none then."""

@@ -15,7 +15,7 @@ from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.kernel import Array, Records, int64, kernel
+from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import system_id_of
 
 STATION_SYSTEM_ID = 255
@@ -279,16 +279,22 @@ def _crc_step(crc: int, byte: int) -> int:
     return crc >> 8 ^ mixed << 8 ^ mixed << 3 ^ mixed >> 4
 
 
-_CRC_TABLE = np.array([_crc_step(0, byte) for byte in range(256)], np.uint16)
+_CRC = np.array([[_crc_step(0, byte) for byte in range(256)]] * 4)
+"""Row k: what a byte with k more behind it adds to the checksum."""
+for _further in range(1, 4):
+    _CRC[_further] = _CRC[_further - 1] >> 8 ^ _CRC[0, _CRC[_further - 1] & 0xFF]
 
 
 @kernel
 def checksum(data: Array, begin: int, end: int, extra: int) -> int:
     """The checksum of a frame whose bytes from its length to its payload are given."""
-    crc = 0xFFFF
-    for place in range(begin, end):
-        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ data[place]) & 0xFF]
-    return crc >> 8 ^ _CRC_TABLE[(crc ^ extra) & 0xFF]
+    crc, fours = 0xFFFF, begin + (end - begin) // 4 * 4
+    for k in range(begin, fours, 4):  # the four lookups do not wait for one another
+        ahead = _CRC[3, (crc ^ data[k]) & 0xFF] ^ _CRC[2, (crc >> 8 ^ data[k + 1]) & 0xFF]
+        crc = ahead ^ _CRC[1, data[k + 2]] ^ _CRC[0, data[k + 3]]
+    for k in range(fours, end):
+        crc = crc >> 8 ^ _CRC[0, (crc ^ data[k]) & 0xFF]
+    return crc >> 8 ^ _CRC[0, (crc ^ extra) & 0xFF]
 
 
 @kernel
@@ -365,7 +371,7 @@ def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, targe
     _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
 
 
-@kernel
+@array_kernel
 def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> NDArray[np.uint8]:
     """The frames (m, bytes) of the set-points of some vehicles, each numbered in a sequence of its own.
 
@@ -380,7 +386,7 @@ def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Ar
     return frames
 
 
-@kernel
+@array_kernel
 def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDArray[np.uint8]:
     """Copies (m, bytes) of a frame for some vehicles, each numbered in a sequence of its own.
 

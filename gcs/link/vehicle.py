@@ -36,7 +36,7 @@ from gcs.link.kinds import (
 from gcs.link.mavlink import REQUEST_FRAME_BYTES, encode_request
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
 from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
-from scenarios.kernel import Array, Cell, Columns, Record, Records, kernel
+from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, kernel
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
 
@@ -102,22 +102,16 @@ def new_links(n: int) -> Links:
 
 def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key_ms: int) -> Block:
     """Set-points to the vehicles that are sent one and have been heard; see `gcs.link.mavlink.set_point_frames`."""
-    rows = _heard(links.known, points["sent"])
+    rows = heard(links.known, points["sent"])
     frames = mavlink.set_point_frames(points, rows, links.known["sequence"], targets, key_ms)
     return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
 
 
 def heartbeats_to(links: Links) -> Block:
     """A HEARTBEAT of the station to all vehicles that have been heard."""
-    rows = _heard(links.known, np.ones(len(links.to), np.bool_))
-    frames = mavlink.same_frames(_HEARTBEAT, mavlink.HEARTBEAT_EXTRA, rows, links.known["sequence"])
+    rows = heard(links.known, np.ones(len(links.to), np.bool_))
+    frames = mavlink.same_frames(HEARTBEAT, mavlink.HEARTBEAT_EXTRA, rows, links.known["sequence"])
     return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
-
-
-def requests_to(links: Links, first: int, count: int, now_ns: int) -> Block:
-    """TIMESYNC requests to so many vehicles in turn, from the `first` on, that have been heard."""
-    frames, sizes, rows = _ask(links.known, links.clocks.known, links.clocks.pending_ns, first, count, now_ns)
-    return Block(frames, sizes, rows, links.to)
 
 
 def note_requests(links: Links, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
@@ -130,8 +124,8 @@ def note_requests(links: Links, outbox: Outbox, sent_ns: NDArray[np.int64]) -> N
         place += count
 
 
-@kernel
-def _heard(known: Records, wanted: Array) -> NDArray[np.int64]:
+@array_kernel
+def heard(known: Records, wanted: Array) -> NDArray[np.int64]:
     """The rows that are wanted and whose vehicles have been heard."""
     rows, found = np.empty(len(known), np.int64), 0
     for row in range(len(known)):
@@ -141,8 +135,8 @@ def _heard(known: Records, wanted: Array) -> NDArray[np.int64]:
     return rows[:found]
 
 
-@kernel
-def _ask(
+@array_kernel
+def ask(
     known: Records, clocks: Records, pending_ns: Array, first: int, count: int, now_ns: int
 ) -> tuple[Array, Array, Array]:
     """Note the requests; returns their frames, the sizes of these and the rows."""
@@ -179,7 +173,7 @@ def _delivery_at_ns(known: Records, clocks: Records, row: int, key_ms: int, sent
     return delivery_ns(known[row], clocks[row], key_ms, sent_ns)
 
 
-_HEARTBEAT = np.frombuffer(mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0), np.uint8)
+HEARTBEAT = np.frombuffer(mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0), np.uint8)
 Report = Callable[[str, str, int], None]
 """Takes an event: its kind, its text and the system id of the vehicle."""
 

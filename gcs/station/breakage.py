@@ -19,6 +19,8 @@ from gcs.control.limits import any_beyond
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.kernel import Record, Records
 
+SURELY_WITHIN = 0.7
+"""A vector whose components are within this share of a limit is not longer than the limit."""
 _TIME_CONSTANTS = 3.0
 """After this many time constants an error has decayed to a twentieth."""
 
@@ -50,7 +52,7 @@ class Breakage:
         self._judged_from_s = [-inf] * n
         self._has_returned = [True] * n
         """Whether the vehicle has been within the limit since it was last granted time to return."""
-        self._all_back = True
+        self.all_back = True
         """Whether this is so of every vehicle, and none is away."""
         self._piloted = [False] * n
         self._behind: list[list[int]] = [[row] for row in range(n)]
@@ -68,7 +70,7 @@ class Breakage:
         if closest_m < self._safety.collision_distance_m:
             one, two = (ids[row] for row in nearest.two)
             return f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart"
-        if not away and self._all_back and not any_beyond(controls["spacing_error_m"], 0.7 * limit_m):
+        if not away and self.all_back and not any_beyond(controls["spacing_error_m"], SURELY_WITHIN * limit_m):
             return ""
         for row in range(len(controls)):
             if row in away:
@@ -81,7 +83,7 @@ class Breakage:
             self._has_returned[row] |= not self._away[row] and not error_m > limit_m  # the leader has no spacing error
             if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
                 return f"broken: spacing error of vehicle {ids[row]} is {error_m:.0f} m, limit {limit_m:g} m"
-        self._all_back = all(self._has_returned) and not any(self._away)
+        self.all_back = all(self._has_returned) and not any(self._away)
         return ""
 
     def _come_back(self, row: int, controls: Records, time_s: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.loops import Loop, Orders
+from gcs.control.loops import GroundLoop, Loop, Orders
 from gcs.control.manoeuvring import loop_of
 from gcs.control.own_law import FlownLaw, LawHooks
 from gcs.control.phases import Phase, patience_s
@@ -36,6 +36,11 @@ class FleetKind(Protocol):
     """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
     holds_when_left_alone: bool
     """Whether a vehicle without set-points holds its velocity; the failsafe of an autopilot may be to fly on."""
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether steps may be usual: see `gcs.station.usual`."""
+        ...
 
     @property
     def identified(self) -> bool:
@@ -90,6 +95,10 @@ class LaunchedFleet:
     speaks_mavlink_1_first = False
     holds_when_left_alone = True
     identified = True
+
+    @property
+    def is_usual(self) -> bool:
+        return isinstance(self.loop, GroundLoop)
 
     def __init__(self, plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> None:
         scenario = plan.scenario

@@ -30,7 +30,7 @@ from gcs.link.mavlink import (
 from gcs.link.sequence import DUPLICATE, NEW, count
 from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns
 from gcs.station.fleet_kind import FleetKind
-from scenarios.kernel import Array, Records, int64, kernel
+from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
 AUTOPILOT_COMPONENT = 1
@@ -54,7 +54,7 @@ _ORDER, _DELIVERY, _JUMP, _EXCHANGE = range(4)
 _NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8")])
 """What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _DELIVERY: tell the loop the
 one-way delay (value_ns) of what was sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns."""
-_NEWS_OF_A_FRAME = 3
+NEWS_OF_A_FRAME = 3
 
 
 class Tables(NamedTuple):
@@ -118,25 +118,25 @@ class Reception:
         """Vehicles that have sent anything that is not usual since `touched` was last cleared."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
-        self._row_of = np.full((LAST_NETWORK + 1, 256), -1)
+        self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
-            self._row_of[network_of(system_id), wire_id(system_id)] = row
+            self.row_of[network_of(system_id), wire_id(system_id)] = row
         self._senders: tuple[int, Sequence[Address], NDArray[np.int64]] = 0, (), np.empty((2, 0), np.int64)
-        """What `_numbered` returned, and how many addresses were known then."""
+        """What `numbered` returned, and how many addresses were known then."""
         self._news_of(1)
 
     def _news_of(self, datagrams: int) -> None:
         """Make room for the news of so many datagrams."""
         links, history = self._fleet.links, self.history
-        news = np.zeros(max(64, 2 * _NEWS_OF_A_FRAME * datagrams), _NEWS)
-        self._tables = Tables(
+        news = np.zeros(max(64, 2 * NEWS_OF_A_FRAME * datagrams), _NEWS)
+        self.tables = Tables(
             links.known, *links.clocks, links.counters, history.reports, history.counts, self.reported,
             self.telemetry_ns, self._fleet.frame_ned_m, *self._fresh, news, np.zeros(1, np.int64),
         )  # fmt: skip
 
     def fresh_rtt_s(self) -> FloatArray:
         """For each vehicle the oldest completed round trip that was not returned before; NaN if there is none."""
-        found_s: FloatArray = _take_fresh(*self._fresh)
+        found_s: FloatArray = take_fresh(*self._fresh)
         return found_s
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
@@ -144,18 +144,21 @@ class Reception:
         row = self._row.get(system_id_of(datagram.address[2], system_id))
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
-    def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int) -> Outbox:
-        """Take datagrams in; returns the answers to them."""
+    def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> Outbox:
+        """Take datagrams in but for the first ones, which a kernel has taken; returns the answers to them."""
         outgoing = Outbox()
         arrivals = datagrams if isinstance(datagrams, Arrivals) else arrivals_of(datagrams)
-        count, place = arrivals.table.shape[1], 0
-        if _NEWS_OF_A_FRAME * count > len(self._tables.news):
+        count, place = arrivals.table.shape[1], taken
+        if taken:
+            self.frames.add(arrivals, 0, taken)
+            self._follow_up(outgoing)
+        if NEWS_OF_A_FRAME * count > len(self.tables.news):
             self._news_of(count)
         now = Now(now_ns, self._start_ns, self._period_ns, self._fleet.loop.heeds_deliveries)
         while place < count:
-            senders = self._numbered(arrivals.addresses)
-            stop = _take_usual(
-                self._tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self._row_of, senders, now
+            senders = self.numbered(arrivals.addresses)
+            stop = take_usual(
+                self.tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self.row_of, senders, now
             )
             if stop > place:
                 self.frames.add(arrivals, place, stop)
@@ -165,7 +168,7 @@ class Reception:
             place = stop + 1
         return outgoing
 
-    def _numbered(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
+    def numbered(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
         """The network of each address, and its number among those that vehicles send from, shape (2, m)."""
         numbers = self._fleet.links.addresses
         known, of, senders = self._senders
@@ -223,7 +226,7 @@ class Reception:
         match frame.msg_id:
             case mavlink.LOCAL_POSITION_NED:
                 boot_ms, *state = fields
-                _take_position(self._tables, row, boot_ms, tuple(state), received_ns, datagram.queued_ns, now)
+                _take_position(self.tables, row, boot_ms, tuple(state), received_ns, datagram.queued_ns, now)
                 self._follow_up(outgoing)
             case mavlink.POSITION_TARGET_LOCAL_NED:
                 at_ns = vehicle.clock.station_ns(fields[0], received_ns)
@@ -235,7 +238,7 @@ class Reception:
                     answer = mavlink.timesync(tc1_ns=received_ns, ts1_ns=ts1_ns)
                     vehicle.send(mavlink.TIMESYNC, answer, outgoing)
                 else:
-                    _take_reply(self._tables, row, tc1_ns, ts1_ns, received_ns, now)
+                    _take_reply(self.tables, row, tc1_ns, ts1_ns, received_ns, now)
                     self._follow_up(outgoing)
             case mavlink.HEARTBEAT:
                 vehicle.heartbeat(fields, received_ns)
@@ -253,11 +256,11 @@ class Reception:
 
     def _follow_up(self, outgoing: Outbox) -> None:
         """Do what the kernels have left to do."""
-        count = self._tables.news_count.item()
+        count = self.tables.news_count.item()
         if not count:
             return
-        news = self._tables.news[:count].tolist()
-        self._tables.news_count[0] = 0
+        news = self.tables.news[:count].tolist()
+        self.tables.news_count[0] = 0
         for kind, row, value_ns, sent_ns in news:
             vehicle = self._fleet.vehicles[row]
             if kind == _ORDER:
@@ -279,8 +282,8 @@ def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int) -> N
     tables.news_count[0] += 1
 
 
-@kernel
-def _take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
+@array_kernel
+def take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
     """For each vehicle its oldest fresh round trip in s, which is fresh no more; NaN if there is none."""
     found_s = np.empty(len(counts))
     for row in range(len(counts)):
@@ -294,12 +297,12 @@ def _take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
 
 
 @kernel
-def _take_usual(
+def take_usual(
     tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, senders: Array, now: Now
 ) -> int:
     """Take in the datagrams from the `first` on; returns the place of one that is not usual, or their number.
 
-    Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `_numbered` returns.
+    Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `Reception.numbered` returns.
     """
     for place in range(first, table.shape[1]):
         begin, end, sender, received_ns = table[0, place], table[1, place], table[2, place], table[3, place]

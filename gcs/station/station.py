@@ -5,7 +5,7 @@ or in virtual time, with the same bytes.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from math import hypot, isfinite, nan
+from math import hypot, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +19,37 @@ from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
-from gcs.link.datagram import Arrivals, Datagram, Outbox
+from gcs.link.datagram import Address, Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import SILENCE_S, RemoteVehicle, heartbeats_to, note_requests, requests_to, set_points_to
+from gcs.link.vehicle import HEARTBEAT, SILENCE_S, RemoteVehicle, heartbeats_to, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
-from gcs.station.breakage import Breakage, not_formed
+from gcs.station.breakage import SURELY_WITHIN, Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
-from gcs.station.monitor import FormationMonitor
+from gcs.station.monitor import FormationMonitor, Seen
 from gcs.station.reception import Reception
 from gcs.station.tick_rows import Judged, Tick, tick_rows
-from scenarios.kernel import Array, Records, kernel
+from gcs.station.usual import (
+    HEARTBEAT_NS,
+    LIMITS,
+    NOT_DUE,
+    SCHEDULE,
+    Due,
+    Usual,
+    commanded,
+    new_scratch,
+    requested,
+)
+from scenarios.kernel import Cell, Columns, Records
 from scenarios.schema import NS_PER_S
 
-_HEARTBEAT_NS = NS_PER_S
 _REQUESTS_APART_NS = 7_000_000
 """Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
 _IN_A_TICK = 250
 """Vehicles whose start-up is looked after at one tick; of more, these take turns."""
+Tolerances = tuple[FloatArray, FloatArray]
+"""How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
 _NEAR = 0.1
 """A vehicle that returns is near its place within this share of the spacing error limit."""
 
@@ -47,6 +59,11 @@ class Station:
 
     `stopwatch_ns` is a clock that times the calls of the user's own control law; None in virtual time.
     """
+
+    next_tick_ns = Cell[int]()
+    """When the next control tick is due."""
+    _next_heartbeat_ns, _next_requests_ns = Cell[int](), Cell[int]()
+    _tick_count = Cell[int]()
 
     def __init__(self, plan: FlightPlan, *, start_ns: int, stopwatch_ns: Callable[[], int] | None = None) -> None:
         scenario = plan.scenario
@@ -71,31 +88,40 @@ class Station:
         self._breakage = Breakage(plan)
         self._has_slots = scenario.has_altitude_slots
         self._limits = SetPointLimits.of(scenario.limits)
-        period_s = self._period_ns / NS_PER_S
+        period_s, timesync_ns = self._period_ns / NS_PER_S, round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
-        self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
-        self.next_tick_ns = start_ns
-        """When the next control tick is due."""
-        self._next_heartbeat_ns = start_ns
+        self._schedule = np.zeros(1, SCHEDULE)
+        self._columns, self._row = Columns(self._schedule), 0
         # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
         # vehicles are sent together.
-        self._next_timesync_ns = self._next_requests_ns = start_ns + self._period_ns // 2
-        self._timesync_spacing_ns = max(1, self._timesync_ns // n)
-        self._requests_apart_ns = min(self._period_ns // 3, _REQUESTS_APART_NS)
-        self._timesync_row = 0
-        self._tick_count = 0
-        self._now_ns = start_ns
+        for name, value in {
+            "now_ns": start_ns, "start_ns": start_ns, "next_tick_ns": start_ns, "next_heartbeat_ns": start_ns,
+            "next_timesync_ns": start_ns + self._period_ns // 2, "next_requests_ns": start_ns + self._period_ns // 2,
+            "period_ns": self._period_ns, "timesync_spacing_ns": max(1, timesync_ns // n),
+            "requests_apart_ns": min(self._period_ns // 3, _REQUESTS_APART_NS),
+        }.items():  # fmt: skip
+            self._schedule[name] = value
         self._repetitions = Repetitions(rates, n)
         self._used_s = np.full(n, nan)
+        self._scratch = new_scratch(n)
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
         self._tolerated = None if measured else self._tolerances(np.zeros(n))
         """The tolerances of every tick, if they do not depend on a measured delay."""
+        safety, limits = scenario.safety, np.zeros(1, LIMITS)
+        limits["acceleration_m_s2"], limits["silence_ns"] = self._limits.acceleration_m_s2, SILENCE_S * NS_PER_S
+        limits["repetition_ns"], limits["has_slots"] = self._repetitions.longest_ns, self._has_slots
+        limits["separable"] = plan.separable
+        limits["spacing_m"], limits["collision_m"] = (
+            SURELY_WITHIN * safety.spacing_error_limit_m,
+            safety.collision_distance_m,
+        )
+        self._judged_by = limits
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
@@ -116,25 +142,84 @@ class Station:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._journal.request_stop(reason)
 
-    def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int) -> tuple[Outbox, Tick | None]:
-        """Take datagrams in and do what is due.
+    def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> tuple[Outbox, Tick | None]:
+        """Take datagrams in, but for those that a usual step has taken in, and do what is due.
 
         Returns
         -------
         datagrams to send, and the control tick if one was due. The driver passes the tick to `complete` once the
         datagrams are sent.
         """
-        self._now_ns = self._journal.now_ns = now_ns
-        outgoing = self._reception.take(datagrams, now_ns)
+        self._columns["now_ns"][0] = self._journal.now_ns = now_ns
+        outgoing = self._reception.take(datagrams, now_ns, taken)
         if now_ns >= self.next_tick_ns:
             return outgoing, self._tick(outgoing)  # set-points do not wait for what may come in a step of its own
         if now_ns >= self._next_heartbeat_ns:
-            self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
+            self._next_heartbeat_ns = now_ns + HEARTBEAT_NS
             outgoing.add(heartbeats_to(self._fleet.links))
         if now_ns >= self._next_requests_ns:
-            self._request_timesync(outgoing)
-            self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
+            links = self._fleet.links
+            asked = requested(self._schedule, links.known, links.clocks.known, links.clocks.pending_ns)
+            outgoing.add(Block(*asked, links.to))
         return outgoing, None
+
+    @property
+    def usual(self) -> Usual:
+        """What usual steps work on; the steps in Python replace parts of it."""
+        monitor, tolerated = self._monitor, self._tolerated
+        assert tolerated is not None
+        return Usual(
+            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law.packed,
+            monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
+            self._critical, monitor.modes, monitor.gain_sets,
+            monitor.released, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,
+            HEARTBEAT, *self._scratch,
+        )  # fmt: skip
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether steps may be usual."""
+        return self._fleet.is_usual and self._tolerated is not None
+
+    def senders(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
+        """See `Reception.numbered`."""
+        return self._reception.numbered(addresses)
+
+    @property
+    def due(self) -> Due:
+        """What usual steps need to know of the next tick."""
+        scenario, time_s = self.plan.scenario, self.scenario_time_s(self.next_tick_ns)
+        waiting = self._journal.stop or self._reception.touched or self._busy or self._gone or self._returning
+        calm = self._breakage.all_back and self._monitor.is_calm(time_s)
+        if self.phase is not Phase.FLYING or waiting or not calm or self._waited_s >= scenario.duration_s:
+            return NOT_DUE
+        return Due(True, time_s, scenario.nominal_velocity_at(time_s))
+
+    def unjudged(self, due: Due) -> Tick:
+        """The tick of a usual step that did not judge it, for `complete`."""
+        due_ns, rtt_s = self._columns["now_ns"][0], self._scratch.rtt_s
+        self._journal.now_ns = due_ns
+        controls, nobody = self._scratch.controls.copy(), np.zeros(len(self.vehicles), np.int64)
+        followed = commanded(controls, self._monitor.released, True)
+        judged = self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
+        return Tick(self._tick_count - 1, due.time_s, due_ns, self._key_ms(due_ns), judged, nobody)
+
+    def _key_ms(self, due_ns: int) -> int:
+        """The `time_boot_ms` of the set-points of a tick."""
+        return (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
+
+    @property
+    def _waited_s(self) -> float:
+        """How long the phase will have lasted at the next tick."""
+        return (self.next_tick_ns - self._phase_since_ns) / NS_PER_S
+
+    def _judged(
+        self, controls: Records, rtt_s: FloatArray, followed: NDArray[np.bool_], tolerated: Tolerances, due_ns: int
+    ) -> Judged:
+        return Judged(
+            self._system_ids, self._monitor.modes, self._monitor.gain_sets, controls, self._reception.reported, rtt_s,
+            followed, *tolerated, self._repetitions.repeated_s(controls["used_ns"], due_ns),
+        )  # fmt: skip
 
     def sent(self, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
         """Note when each datagram of a step was sent, if that was later than the step."""
@@ -153,16 +238,16 @@ class Station:
             away = dict.fromkeys(self._monitor.away, False)
             away |= self._gone
             self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
-        at_ns = np.asarray(sent_ns, np.int64) if len(sent_ns) else np.array([self._now_ns])
+        at_ns = np.asarray(sent_ns, np.int64) if len(sent_ns) else np.array([self._journal.now_ns])
         own_ns = at_ns[tick.set_point_indices]  # -1 finds the last one, for vehicles that were sent none
-        rows, self._used_s = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
+        rows, self._used_s[:] = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
         return rows
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
-        behind = (self._now_ns - due_ns) // self._period_ns
+        behind = (self._journal.now_ns - due_ns) // self._period_ns
         self.next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
         self._decide(due_ns, outgoing)
         if self.phase is Phase.CONNECTING:
@@ -175,25 +260,22 @@ class Station:
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
         self._fleet.bound(controls, blends)
         self._limits.limit_commands(controls["command_m_s2"])
-        key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
-        commanded = _commanded(controls, self._monitor.released, flying)
-        orders = Orders(controls, commanded, nominal_m_s, due_ns)
+        key_ms = self._key_ms(due_ns)
+        followed = commanded(controls, self._monitor.released, flying)
+        orders = Orders(controls, followed, nominal_m_s, due_ns)
         points = self._fleet.set_points(orders, self.phase)
         self._limits.limit(points)  # last, so that it holds whoever computed them
         self._fleet.loop.sent(due_ns, points)
         indices = self._send_set_points(points, key_ms, outgoing)
         for row in self._in_turn(sorted(self._busy)):
-            frame = self.vehicles[row].next_frame(self._now_ns)
+            frame = self.vehicles[row].next_frame(self._journal.now_ns)
             if frame is not None and (address := self.vehicles[row].address) is not None:
                 outgoing.append((frame, address))
             if self.vehicles[row].idle:
                 self._busy.discard(row)
-        shorter_s, self._monitor.margins_s = self._tolerated or self._tolerances(controls["assumed_s"])
-        judged = Judged(
-            self._system_ids, self._monitor.modes, self._monitor.gain_sets, controls,
-            self._reception.reported, self._reception.fresh_rtt_s(), commanded,
-            shorter_s, self._monitor.margins_s, self._repetitions.repeated_s(controls["used_ns"], due_ns),
-        )  # fmt: skip
+        tolerated = self._tolerated or self._tolerances(controls["assumed_s"])
+        self._monitor.margins_s = tolerated[1]
+        judged = self._judged(controls, self._reception.fresh_rtt_s(), followed, tolerated, due_ns)
         tick = Tick(self._tick_count, time_s, due_ns, key_ms, judged, indices)
         self._tick_count += 1 + behind
         return tick
@@ -205,7 +287,7 @@ class Station:
         outgoing.add(sent)
         return indices
 
-    def _tolerances(self, assumed_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _tolerances(self, assumed_s: FloatArray) -> Tolerances:
         """How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
         each = [*map(self.plan.tolerance, assumed_s.tolist())]
         return np.array([own.shorter_s for own in each]), np.array([own.longer_s for own in each])
@@ -231,7 +313,7 @@ class Station:
     def _decide(self, due_ns: int, outgoing: Outbox) -> None:
         """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
-        silent = self._now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
+        silent = self._journal.now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
         self._look_at(self._reception.touched if flying else self._reception.touched | {*self._in_turn(self._rows)})
         self._reception.touched.clear()
         absent = [*self._why_absent] if flying else [""] * len(self.vehicles)
@@ -250,8 +332,8 @@ class Station:
             self._gone = {row: why in PILOTED for row, why in enumerate(absent) if why}
             self._set_law()
         time_s = self.scenario_time_s(due_ns)
-        changes = self._monitor.update(time_s, silent, self._guided, self._critical, self._used_s, flying=flying)
-        for row, before, after in changes:
+        seen = Seen(time_s, flying, silent, self._guided, self._critical, self._used_s)
+        for row, before, after in self._monitor.update(seen):
             vehicle = self.vehicles[row]
             if flying:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
@@ -334,26 +416,9 @@ class Station:
 
     # -- sending and reporting -------------------------------------------------------------------------------------
 
-    def _request_timesync(self, outgoing: Outbox) -> None:
-        """Ask the vehicles whose turn has come for the time on their clocks."""
-        due = max(0, (self._now_ns - self._next_timesync_ns) // self._timesync_spacing_ns + 1)
-        outgoing.add(requests_to(self._fleet.links, self._timesync_row, due, self._now_ns))
-        self._timesync_row = (self._timesync_row + due) % len(self.vehicles)
-        self._next_timesync_ns += due * self._timesync_spacing_ns
-
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""
         if vehicle.external:
             return
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         vehicle.send(mavlink.STATUSTEXT, fields, outgoing)
-
-
-@kernel
-def _commanded(controls: Records, released: Array, flying: bool) -> NDArray[np.bool_]:
-    """Which vehicles are to follow the control law."""
-    commanded = np.empty(len(controls), np.bool_)
-    for row in range(len(controls)):
-        command = controls[row].command_m_s2
-        commanded[row] = flying and not released[row] and isfinite(command[0]) and isfinite(command[1])
-    return commanded

@@ -59,12 +59,12 @@ def tick_rows(
     prediction.
     """
     rows, used = np.empty(len(sent_ns), TICK), np.empty(len(sent_ns))
-    _fill(rows, used, links.known, links.clocks.known, links.counters, tick.judged, nearest_m, sent_ns, *tick[:4])
+    fill(rows, used, links.known, links.clocks.known, links.counters, tick.judged, nearest_m, sent_ns, *tick[:4])
     return rows, used
 
 
 @kernel
-def _fill(
+def fill(
     rows: Records, used: Array, links: Records, clocks: Records, counters: Records, judged: Judged,
     nearest_m: Array, sent_ns: Array, number: int, time_s: float, due_ns: int, key_ms: int,
 ) -> None:  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
-from gcs.control.tick import TickArray
+from gcs.control.tick import TickArray, in_sequence
 from gcs.drive.lockstep import LINK_DOWN, LINK_UP, START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
@@ -164,7 +164,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         raise GainsError(unstable)
     losses = LinkLosses()
     station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan.scenario, recorder=losses))
-    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=counted, station=station)))
+    ticks = in_sequence([*fly_lockstep(plan, vehicles=counted, station=station)])
     flown = ticks[ticks["time_s"] >= 0.0]
     commanded = flown[flown["commanded"]]
     headroom_p01 = _percentile(commanded["headroom"], 1)

@@ -137,8 +137,7 @@ def _closed_loops(
 
 def _aircraft(scenario: Scenario) -> Iterator[Row]:
     flight = benchmark(with_vehicles(scenario, _SMALLEST), seconds=2.0, repeat=3)
-    whole_s = 1.0 / flight.control_hz / flight.real_time_factor
-    vehicle_s = (whole_s - flight.station_s_per_tick) * flight.control_hz / _SMALLEST
+    vehicle_s = flight.vehicles_s_per_tick * flight.control_hz / _SMALLEST
     with tempfile.TemporaryDirectory(prefix="peers-") as name:
         found = run_script("aircraft", folder=Path(name))
     work = "a vehicle for a second: ours with links and MAVLink, theirs an aircraft without"

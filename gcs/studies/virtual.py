@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gcs.control.tick import Event, TickArray
+from gcs.control.tick import Event, TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
 from gcs.errors import InputError
@@ -145,7 +145,7 @@ def fly_virtual(
             raise InputError(f"{scenario.name}: {unstable}")
         plan = without_actions(plan)
     station = Station(plan, start_ns=START_NS)
-    ticks = np.stack(list(fly_lockstep(plan, station=station)))
+    ticks = in_sequence([*fly_lockstep(plan, station=station)]).reshape(-1, len(station.vehicles))
     if station.plan is not plan:
         design = described(design, station.plan)
     events = (*station.events, Event(time_s=float(ticks["time_s"][-1, 0]), kind=END, text=station.end_reason))

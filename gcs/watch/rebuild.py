@@ -20,14 +20,14 @@ from gcs.control.history import StateHistory
 from gcs.control.law import nearest, unblended
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Vector
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
 from gcs.station.fleet_kind import fleet_of
-from gcs.station.monitor import VehicleState
+from gcs.station.modes import VehicleState
 from gcs.station.reception import new_reported
 from gcs.station.tick_rows import Judged, Tick, tick_rows
 from gcs.watch.links import Watch, WatchedVehicle
@@ -186,7 +186,7 @@ class _Rebuilding:
     def finished(self) -> Rebuilt:
         self._close_tick()
         self._look(self._newest_ns + self._period_ns)  # takes in what came after the last tick
-        rows = np.concatenate(self._rows) if self._rows else np.empty(0, TICK)
+        rows = in_sequence(self._rows) if self._rows else np.empty(0, TICK)
         rows = rows[np.argsort(rows["tick"], kind="stable")]
         return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys))
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from scenarios.kernel import Columns, Records
 from scenarios.keys.link import Links
 from scenarios.schema import NS_PER_S
 from scenarios.signing.link import SignedLink
-from scenarios.sockets import Bytes
+from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
 from sim_vehicles.links.truth import MemoryRecorder, Recorder, can_record
@@ -50,6 +51,20 @@ class _Member:
     signed: SignedLink | None = None
     acts_ns: int = NEVER_NS
     """When the vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
+
+
+class FleetArrays(NamedTuple):
+    """What a kernel needs to run the usual events of a fleet."""
+
+    vehicles: Records
+    links: Records
+    entries: Records
+    frames: Bytes
+    draws: Records
+    truth: Records
+    waiting: Ints
+    leaving: Ints
+    leaving_data: Bytes
 
 
 class Fleet:
@@ -90,6 +105,7 @@ class Fleet:
         self._waiting = np.zeros((count, 2), np.int64)
         most = max(64, 2 * count)  # datagrams that leave at one time; of more, the kernel returns a part
         self._leaving, self._leaving_data = np.zeros((4, most), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
+        self._edge = self._waiting, self._leaving, self._leaving_data
         self._acts: list[tuple[int, int]] = []
         """(acts_ns, system id), if events run in order of time; stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
@@ -177,12 +193,18 @@ class Fleet:
             self._run_in_order(received, now_ns)
             received = ()
         entering = received if isinstance(received, Datagrams) else datagrams_of(received, self._rows)
-        edge = entering.stream, entering.table, self._waiting, self._leaving, self._leaving_data
-        entered, waiting, leaving = step_all(*self._arrays(), *edge, 0, now_ns)
+        begun = step_all(*self._arrays(), entering.stream, entering.table, *self._edge, 0, now_ns)
+        return self.go_on(entering, *begun, now_ns)
+
+    def go_on(
+        self, entering: Datagrams, entered: int, waiting: int, leaving: int, now_ns: int
+    ) -> Datagrams | list[Datagram]:
+        """Finish a step that `step_all` has begun, which returned the three numbers."""
         while entered < len(entering):
             begin, end, row, time_ns = entering.table[:, entered].tolist()
             self._in_rows[row].down.send(entering.stream[begin:end].tobytes(), time_ns)
-            entered, waiting, leaving = step_all(*self._arrays(), *edge, entered + 1, now_ns)
+            stream, table = entering.stream, entering.table
+            entered, waiting, leaving = step_all(*self._arrays(), stream, table, *self._edge, entered + 1, now_ns)
         if waiting:
             self._run_waiting(waiting, now_ns)
             leaving = self._leave(now_ns)
@@ -194,6 +216,22 @@ class Fleet:
             out += self._left(leaving)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether `step` does nothing before `step_all`, and what leaves is not recorded."""
+        begun = self._links.zero_ns != NEVER_NS and self._external is None
+        return begun and not self._in_order and self._recorder is None
+
+    @property
+    def arrays(self) -> FleetArrays:
+        """What `step_all` works on; a step may replace parts of it, but not one by kernels alone."""
+        return FleetArrays(*self._arrays(), *self._edge)
+
+    @property
+    def most_leaving(self) -> int:
+        """How many datagrams can leave in one call of `step_all`."""
+        return self._leaving.shape[1]
 
     def _leave(self, now_ns: int) -> int:
         """Let datagrams leave; returns how many."""

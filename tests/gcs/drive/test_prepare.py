@@ -7,11 +7,12 @@ import pytest
 
 FLIGHT = """
 import gc, sys
-from gcs.drive.lockstep import fly_lockstep, prepare
+from gcs.drive.lockstep import fly_lockstep, prepare, vehicles_of
 from gcs.plan.planner import flight_plan
 from scenarios.files import load
 from scenarios.keys.link import Link, Links
 from scenarios.schema import Response
+from tests.gcs.drive.test_usual_steps import StepByStep
 from tests.support.paths import SCENARIOS
 
 def compiled():
@@ -30,7 +31,7 @@ _, plan = flight_plan(scenario.model_copy(update=changes))
 prepare(plan)
 before = compiled()
 assert len(before) > 10
-assert sum(1 for _ in fly_lockstep(plan)) > 200
+assert sum(1 for _ in fly_lockstep(plan, vehicles=StepByStep(vehicles_of(plan.scenario)))) > 200  # as in real time
 assert compiled() == before, {name: count for name, count in compiled().items() if before.get(name) != count}
 """
 

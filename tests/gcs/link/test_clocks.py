@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from gcs.link.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
-from gcs.link.datagram import Outbox
-from gcs.link.vehicle import new_links, note_requests, requests_to
+from gcs.link.datagram import Block, Outbox
+from gcs.link.vehicle import ask, new_links, note_requests
 from scenarios.schema import DRIFT_MAX_PPM, Clocks
 
 MS = 1_000_000
@@ -43,7 +43,7 @@ def test_round_trips_count_from_when_requests_were_sent() -> None:
     links, outbox = new_links(3), Outbox()
     links.to[:], links.known["address"] = addresses, range(3)
     outbox.append((b"something else", addresses[0]))
-    outbox.add(requests_to(links, 0, 3, 7 * S))
+    outbox.add(Block(*ask(links.known, links.clocks.known, links.clocks.pending_ns, 0, 3, 7 * S), links.to))
     note_requests(links, outbox, 7 * S + np.array([1, 2, 3, 4]) * MS)
     for row in range(3):
         clock = VehicleClock(links.clocks, row)

@@ -1,7 +1,6 @@
 """The monitor: every row of its transition table, and that a change of gains does not jump."""
 
-from dataclasses import replace
-from math import nan
+from math import inf, nan
 
 import numpy as np
 import pytest
@@ -9,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.control.tick import Mode
-from gcs.station.monitor import FormationMonitor, Observation, VehicleState, monitored
+from gcs.station.modes import Observation, VehicleState, monitored
+from gcs.station.monitor import FormationMonitor, Seen
 from scenarios.schema import Monitor
 
 MARGINS_S = (0.3, 0.6, 1.2)
@@ -54,7 +54,7 @@ def test_vehicle_heard_and_guided_again_recovers_on_the_slowest_gains(mode: Mode
 
 
 def test_flight_begins_nominal_on_the_fastest_gains() -> None:
-    assert after(VehicleState()) == replace(NOMINAL, eased_s=None)
+    assert after(VehicleState()) == NOMINAL._replace(eased_s=inf)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_no_second_change_while_gains_are_blended() -> None:
 def test_slower_gains_with_headroom_are_caution_until_the_link_returns() -> None:
     state = after(NOMINAL, seconds=2.0, loop_delay_s=0.29)
     assert (state.mode, state.gain_set) == (Mode.CAUTION, 1)
-    state = replace(state, changed_s=0.0)
+    state = state._replace(changed_s=0.0)
     # Against the faster margin of 0.3 s: wanted is a headroom of 0.35 for 3 s.
     assert after(state, seconds=10.0, loop_delay_s=0.3 * 0.66).gain_set == 1
     assert after(state, seconds=2.9, loop_delay_s=0.3 * 0.64).gain_set == 1
@@ -128,7 +128,7 @@ def test_the_slowest_gains_release_a_vehicle_only_without_headroom() -> None:
     # It stays so while there is no headroom, though its failsafe shows, and comes back by way of FAILSAFE.
     still = after(released, seconds=10.0, loop_delay_s=with_headroom(0.3, 2), guided=False)
     assert still.released
-    freed = after(replace(released, eased_s=None), seconds=3.1, loop_delay_s=with_headroom(0.4, 2), guided=False)
+    freed = after(released._replace(eased_s=inf), seconds=3.1, loop_delay_s=with_headroom(0.4, 2), guided=False)
     assert (freed.released, freed.mode) == (False, Mode.FAILSAFE)
     assert after(freed, guided=True).mode is Mode.RECOVERING
 
@@ -169,7 +169,7 @@ def update(
 ) -> list[tuple[int, VehicleState, VehicleState]]:
     """Tick k at 50 Hz, with every vehicle heard and guided."""
     yes, no = np.ones(len(delays_s), np.bool_), np.zeros(len(delays_s), np.bool_)
-    return monitor.update(0.02 * k, no, yes, no, np.array(delays_s), flying=flying)
+    return monitor.update(Seen(0.02 * k, flying, no, yes, no, np.array(delays_s)))
 
 
 def test_in_a_tree_a_late_vehicle_changes_only_its_gains() -> None:

@@ -1,0 +1,200 @@
+"""The mode and the gain set of one vehicle, as its headroom changes: `monitored` is the whole decision.
+
+As headroom shrinks, the vehicle's gains change to slower sets, and it is released to its failsafe last; when the link
+recovers, these actions are undone in the reverse order. What it takes for each is in one table.
+"""
+
+from math import inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gcs.control.loop_delay import headroom
+from gcs.control.tick import Mode
+from scenarios.kernel import Array, kernel
+from scenarios.schema import Monitor
+
+_NUMBERS: Any = tuple(int(mode) for mode in Mode)
+_WAITING, _NOMINAL, _CAUTION, _CRITICAL, _FAILSAFE, _LOST, _RECOVERING = _NUMBERS
+_headroom = kernel(headroom)
+STATE = np.dtype(
+    [
+        ("mode", "i8"), ("gain_set", "i8"), ("former_set", "i8"), ("changed_s", "f8"),
+        ("pressed_s", "f8"), ("eased_s", "f8"), ("released", "?"),
+    ],
+    align=True,
+)  # fmt: skip
+"""`VehicleState` as a record."""
+
+
+class VehicleState(NamedTuple):
+    """What the monitor remembers of one vehicle. Times are scenario times in s."""
+
+    mode: Mode = Mode.WAITING
+    gain_set: int = 0
+    """Place in the schedule, 0 the fastest."""
+    former_set: int = 0
+    """The set before the last change; blended out until `changed_s` + `blend_s`."""
+    changed_s: float = -1e9
+    pressed_s: float = inf
+    """Since when headroom has been low enough for slower gains; infinite if it is not."""
+    eased_s: float = inf
+    """Since when headroom has been high enough for faster gains; infinite if it is not."""
+    released: bool = False
+
+
+class Observation(NamedTuple):
+    """What is known of one vehicle at a tick.
+
+    `loop_delay_s` may be NaN (unknown). With prediction it is the part of the delay that counts against the margin,
+    see `gcs.plan.mismatch.Tolerated.used_s`.
+    """
+
+    time_s: float
+    flying: bool
+    """Whether the formation is flown; the same for all vehicles."""
+    silent: bool
+    guided: bool
+    failsafe: bool
+    loop_delay_s: float
+
+
+class Policy(NamedTuple):
+    """What `scenarios.schema.Monitor` says of the modes of a vehicle."""
+
+    act: bool
+    caution_headroom: float
+    critical_headroom: float
+    hysteresis: float
+    hold_s: float
+    ease_s: float
+    blend_s: float
+
+
+def policy_of(monitor: Monitor) -> Policy:
+    return Policy(*(getattr(monitor, name) for name in Policy._fields))
+
+
+def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
+    """The state after one tick.
+
+    h is the headroom of the set flown, h+ that of the next faster set. "For hold" and "for ease" mean that the
+    condition has lasted `policy.hold_s` or `policy.ease_s`. The first row that fits applies:
+
+    ==================  ====================================================  ============================
+    from                when                                                  to
+    ==================  ====================================================  ============================
+    any                 formation not flown, vehicle in failsafe              FAILSAFE
+    any                 formation not flown                                   WAITING
+    any                 silent                                                LOST
+    any, released       h > caution + hysteresis for ease                     FAILSAFE, no longer released
+    any, released       otherwise                                             FAILSAFE
+    any                 not guided                                            FAILSAFE
+    LOST, FAILSAFE      heard and guided again                                RECOVERING, slowest set
+    WAITING             guided                                                NOMINAL, fastest set
+    any                 h < critical for hold, a slower set exists            CRITICAL, next slower set
+    CRITICAL            h < 0 for hold, slowest set                           FAILSAFE, released
+    any                 h < critical for hold, slowest set                    CRITICAL
+    any, slower set     h+ > caution + hysteresis for ease                    RECOVERING, next faster set
+    CRITICAL            h > critical + hysteresis for hold                    CAUTION
+    NOMINAL             h < caution                                           CAUTION
+    CAUTION             h > caution + hysteresis for hold, fastest set        NOMINAL
+    RECOVERING          gains blended in: fastest set / slower set            NOMINAL / CAUTION
+    ==================  ====================================================  ============================
+
+    Gains do not change again while they are being blended. With `policy.act` off the modes are the same, but the gains
+    stay the fastest set and no vehicle is released.
+    """
+    number: Any = int(state.mode)
+    after = next_state(state._replace(mode=number), seen, np.array(margins_s), policy_of(policy))
+    return after._replace(mode=Mode(after.mode))
+
+
+@kernel
+def next_state(state: VehicleState, seen: Observation, margins_s: Array, policy: Policy) -> VehicleState:
+    """See `monitored`; modes are numbers."""
+    away = state.mode == _LOST or state.mode == _FAILSAFE  # noqa: PLR1714 - Numba would make a tuple of them
+    slowest = len(margins_s) - 1 if policy.act else 0
+    if not seen.flying:
+        return VehicleState(_FAILSAFE if seen.failsafe else _WAITING, 0, 0, -1e9, inf, inf, False)
+    if seen.silent or not (seen.guided or state.released):
+        return _with(state, _LOST if seen.silent else _FAILSAFE, inf, inf)
+    if away and not state.released:
+        return _with_gains(_with(state, _RECOVERING, state.pressed_s, state.eased_s), slowest, seen.time_s)
+    if state.mode == _WAITING:
+        return _with(state, _NOMINAL, state.pressed_s, state.eased_s)
+    own = _headroom(seen.loop_delay_s, margins_s[state.gain_set])
+    if is_at_ease(state) and not own < policy.caution_headroom:
+        return state
+    # a released vehicle returns to the slowest set
+    faster = own if state.released else _headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
+    return _by_headroom(state, own, faster, slowest, policy, seen.time_s)
+
+
+@kernel
+def _by_headroom(
+    state: VehicleState, own: float, faster: float, slowest: int, policy: Policy, now_s: float
+) -> VehicleState:
+    """The rows of the table that depend on headroom: of the set flown, and of the next faster one."""
+    last_resort = state.gain_set == slowest and state.mode == _CRITICAL and not state.released
+    pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
+    eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
+    blending = now_s < state.changed_s + policy.blend_s
+    if not blending and now_s - pressed_s >= policy.hold_s and not state.released:
+        pressed = _with(state, _CRITICAL, inf, inf)
+        if state.gain_set < slowest:
+            return _with_gains(pressed, state.gain_set + 1, now_s)
+        return _released(pressed, True) if policy.act and last_resort else pressed
+    if not blending and now_s - eased_s >= policy.ease_s:
+        if state.released:
+            return _released(_with(state, _FAILSAFE, pressed_s, inf), False)
+        if state.gain_set > 0:
+            return _with_gains(_with(state, _RECOVERING, pressed_s, inf), state.gain_set - 1, now_s)
+    held = _with(state, state.mode, pressed_s, eased_s)
+    return _with(held, _steady_mode(held, own, blending, policy, now_s), pressed_s, eased_s)
+
+
+@kernel
+def is_at_ease(state: VehicleState) -> bool:
+    """Whether it is NOMINAL and no timer runs; `state` may be a record."""
+    return state.mode == _NOMINAL and state.pressed_s == inf and state.eased_s == inf
+
+
+@kernel
+def _steady_mode(state: VehicleState, own: float, blending: bool, policy: Policy, now_s: float) -> Any:
+    """The mode when the gains do not change."""
+    fastest, mode = state.gain_set == 0, state.mode
+    if state.released:
+        return _FAILSAFE
+    if mode == _CRITICAL and own > policy.critical_headroom + policy.hysteresis and not blending:
+        return _CAUTION
+    if mode == _NOMINAL and own < policy.caution_headroom:
+        return _CAUTION
+    if mode == _CAUTION and fastest and now_s - state.eased_s >= policy.hold_s:
+        return _NOMINAL
+    if mode == _RECOVERING and not blending:
+        return _NOMINAL if fastest else _CAUTION
+    return mode
+
+
+@kernel
+def _with(state: VehicleState, mode: Any, pressed_s: float, eased_s: float) -> VehicleState:
+    return VehicleState(mode, state.gain_set, state.former_set, state.changed_s, pressed_s, eased_s, state.released)
+
+
+@kernel
+def _with_gains(state: VehicleState, gain_set: int, now_s: float) -> VehicleState:
+    if gain_set == state.gain_set:
+        return state
+    return VehicleState(state.mode, gain_set, state.gain_set, now_s, state.pressed_s, state.eased_s, state.released)
+
+
+@kernel
+def _released(state: VehicleState, released: bool) -> VehicleState:
+    gain_set, former_set = state.gain_set, state.former_set
+    return VehicleState(_FAILSAFE, gain_set, former_set, state.changed_s, state.pressed_s, state.eased_s, released)
+
+
+@kernel
+def _since(since_s: float, holds: bool, now_s: float) -> float:
+    return min(since_s, now_s) if holds else inf

@@ -1,0 +1,238 @@
+"""The usual step of a station in one kernel: nothing happens that Python has to see to.
+
+Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation in flight
+whose loop the station closes without prediction, with every vehicle heard, guided and at ease. It is made of the same
+kernels as the steps in Python, which take over wherever this one stops.
+"""
+
+from math import inf, isfinite, isnan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gcs.control.history import every_at, every_newest
+from gcs.control.law import CONTROL, PackedLaw, control_all, nearest_of
+from gcs.control.limits import any_beyond, shorten
+from gcs.control.loop_delay import repeated_s
+from gcs.control.loops import accelerations
+from gcs.link.mavlink import HEARTBEAT_EXTRA, SET_POINT, same_frames, set_point_frames
+from gcs.link.vehicle import ask, heard
+from gcs.station.modes import Policy
+from gcs.station.monitor import Seen, Watched, judge, settle
+from gcs.station.reception import NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
+from gcs.station.tick_rows import Judged, fill
+from scenarios.kernel import Array, Records, array_kernel
+from scenarios.sockets import Bytes, Ints
+
+HEARTBEAT_NS = 1_000_000_000
+SCHEDULE = np.dtype(
+    [
+        ("now_ns", "i8"), ("next_tick_ns", "i8"), ("next_heartbeat_ns", "i8"),
+        ("next_requests_ns", "i8"), ("next_timesync_ns", "i8"),  # the next wake-up for requests, and the next request
+        ("timesync_row", "i8"),  # whom it asks
+        ("tick_count", "i8"),
+        ("start_ns", "i8"), ("period_ns", "i8"), ("timesync_spacing_ns", "i8"), ("requests_apart_ns", "i8"),
+    ]
+)  # fmt: skip
+"""When a station does what."""
+LIMITS = np.dtype(
+    [
+        ("acceleration_m_s2", "f8"),
+        ("silence_ns", "i8"), ("repetition_ns", "i8"),
+        ("separable", "?"),
+        ("spacing_m", "f8"), ("collision_m", "f8"), ("has_slots", "?"),
+    ],
+    align=True,
+)  # fmt: skip
+"""What a tick is judged by."""
+DONE, WITH_TICK, NOT_TAKEN, NOT_DONE, NOT_JUDGED = range(5)
+"""How far a step came: it is done; with the rows of its tick; only some of its datagrams are taken in; these are, but
+nothing else is done; it is done but for the rows of its tick, as the formation may be broken."""
+
+
+class Scratch(NamedTuple):
+    """What a usual tick computes of n vehicles."""
+
+    controls: Records
+    """Of `gcs.control.law.CONTROL`."""
+    points: Records
+    """Of `gcs.link.mavlink.SET_POINT`."""
+    rtt_s: FloatArray
+
+
+def new_scratch(n: int) -> Scratch:
+    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n))
+
+
+class Usual(NamedTuple):
+    """All that usual steps work on, of n vehicles."""
+
+    schedule: Records
+    """Of SCHEDULE, (1,)."""
+    limits: Records
+    """Of LIMITS, (1,)."""
+    tables: Tables
+    row_of: Ints
+    law: PackedLaw
+    blends: Records
+    watched: Watched
+    policy: Policy
+    guided: NDArray[np.bool_]
+    critical: NDArray[np.bool_]
+    modes: Ints
+    gain_sets: Ints
+    released: NDArray[np.bool_]
+    shorter_s: FloatArray
+    used_s: FloatArray
+    repeated_ns: Ints
+    system_ids: Ints
+    targets: Ints
+    heartbeat: Bytes
+    controls: Records
+    """This and the rest: see `Scratch`."""
+    points: Records
+    rtt_s: FloatArray
+
+
+class Due(NamedTuple):
+    """What Python knows of the tick that is due next."""
+
+    is_usual: bool
+    """Whether a kernel may do it, as far as Python knows."""
+    time_s: float = 0.0
+    """Scenario time."""
+    nominal_velocity_m_s: tuple[float, float] = (0.0, 0.0)
+
+
+NOT_DUE = Due(False)
+
+
+class Sending(NamedTuple):
+    """Frames of equal width to vehicles: frame k is the first `sizes[k]` bytes of `frames[k]`, to the one in a row."""
+
+    frames: Bytes
+    sizes: Ints
+    rows: Ints
+
+
+@array_kernel
+def usual_step(
+    usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Due, rows: Records
+) -> tuple[int, int, Sending, Sending]:
+    """Do a step at `now_ns` of the schedule as far as it is usual.
+
+    Stream, table and `queued_ns` are those of `Arrivals`. Returns how far it came, how many datagrams are taken in, and
+    what is sent, in order. `rows` are those of the tick.
+    """
+    schedule, tables = usual.schedule[0], usual.tables
+    nothing, taken = _nothing(), 0
+    if NEWS_OF_A_FRAME * table.shape[1] > len(tables.news):
+        return NOT_TAKEN, taken, nothing, nothing
+    now = Now(schedule.now_ns, schedule.start_ns, schedule.period_ns, False)
+    taken = take_usual(tables, stream, table, queued_ns, 0, usual.row_of, senders, now)
+    if taken < table.shape[1]:
+        return NOT_TAKEN, taken, nothing, nothing
+    if tables.news_count[0]:
+        return NOT_DONE, taken, nothing, nothing
+    if schedule.now_ns >= schedule.next_tick_ns:
+        if not due.is_usual or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due.time_s):
+            return NOT_DONE, taken, nothing, nothing
+        set_points, judged = _tick(usual, due, rows)
+        return (WITH_TICK if judged else NOT_JUDGED), taken, set_points, nothing
+    heartbeats = requests = nothing
+    known = tables.links
+    if schedule.now_ns >= schedule.next_heartbeat_ns:
+        schedule.next_heartbeat_ns = schedule.now_ns + HEARTBEAT_NS
+        to = heard(known, np.ones(len(known), np.bool_))
+        frames = same_frames(usual.heartbeat, HEARTBEAT_EXTRA, to, known.sequence)
+        heartbeats = Sending(frames, np.full(len(to), frames.shape[1]), to)
+    if schedule.now_ns >= schedule.next_requests_ns:
+        frames, sizes, to = requested(usual.schedule, known, tables.clocks, tables.pending_ns)
+        requests = Sending(frames, sizes, to)
+    return DONE, taken, heartbeats, requests
+
+
+@array_kernel
+def _nothing() -> Sending:
+    return Sending(np.empty((0, 0), np.uint8), np.empty(0, np.int64), np.empty(0, np.int64))
+
+
+@array_kernel
+def requested(schedules: Records, known: Records, clocks: Records, pending_ns: Array) -> tuple[Bytes, Ints, Ints]:
+    """Ask the vehicles whose turn has come for the time on their clocks; returns what `ask` does."""
+    schedule = schedules[0]
+    due = max(0, (schedule.now_ns - schedule.next_timesync_ns) // schedule.timesync_spacing_ns + 1)
+    first = schedule.timesync_row
+    schedule.timesync_row = (first + due) % len(known)
+    schedule.next_timesync_ns += due * schedule.timesync_spacing_ns
+    schedule.next_requests_ns = max(schedule.next_timesync_ns, schedule.next_requests_ns + schedule.requests_apart_ns)
+    return ask(known, clocks, pending_ns, first, due, schedule.now_ns)
+
+
+@array_kernel
+def _is_calm(usual: Usual, time_s: float) -> bool:
+    """Whether the monitor has nothing to do but to note delays and times, which is done only then."""
+    limits, n = usual.limits[0], len(usual.used_s)
+    silent = np.zeros(n, np.bool_)
+    for row in range(n):
+        silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
+    seen = Seen(time_s, True, silent, usual.guided, usual.critical, usual.used_s)
+    if len(judge(usual.watched, seen, usual.policy, limits.separable)):
+        usual.watched.judged[0] -= 1
+        return False
+    settle(usual.watched)
+    return True
+
+
+@array_kernel
+def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
+    """The tick due now; returns the set-points, and whether the rows are filled, as the formation is not broken."""
+    schedule, limits, tables, law = usual.schedule[0], usual.limits[0], usual.tables, usual.law
+    controls, points, due_ns, number = usual.controls, usual.points, schedule.now_ns, schedule.tick_count
+    schedule.next_tick_ns = due_ns + schedule.period_ns
+    schedule.tick_count = number + 1
+    north_m_s, east_m_s = due.nominal_velocity_m_s
+    times_ns, states = every_newest(tables.reports, tables.report_counts)
+    seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
+    control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
+    shorten(controls.command_m_s2, limits.acceleration_m_s2)
+    orders = commanded(controls, usual.released, True)
+    accelerations(points, controls, orders)
+    shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
+    key_ms = (due_ns - schedule.start_ns) // 1_000_000 & 0xFFFFFFFF
+    to = heard(tables.links, points.sent)
+    frames = set_point_frames(points, to, tables.links.sequence, usual.targets, key_ms)
+    sent = Sending(frames, np.full(len(to), frames.shape[1]), to)
+    usual.rtt_s[:] = take_fresh(tables.fresh_ns, tables.fresh_counts)
+    repeated = repeated_s(usual.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
+    down_m = np.empty(len(controls) if limits.has_slots else 0)
+    for row in range(len(down_m)):
+        down_m[row] = tables.reported[row].down_m
+    near_m, _ = nearest_of(controls, due_ns, down_m)
+    closest_m = inf
+    for row in range(len(near_m)):
+        closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
+    if closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m):
+        return sent, False
+    judged = Judged(
+        usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, orders,
+        usual.shorter_s, usual.watched.margins_s, repeated,
+    )  # fmt: skip
+    sent_ns = np.full(len(controls), due_ns)
+    fill(
+        rows, usual.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
+        number, due.time_s, due_ns, key_ms,
+    )  # fmt: skip
+    return sent, True
+
+
+@array_kernel
+def commanded(controls: Records, released: Array, flying: bool) -> NDArray[np.bool_]:
+    """Which vehicles are to follow the control law."""
+    found = np.empty(len(controls), np.bool_)
+    for row in range(len(controls)):
+        command = controls[row].command_m_s2
+        found[row] = flying and not released[row] and isfinite(command[0]) and isfinite(command[1])
+    return found

@@ -1,0 +1,88 @@
+"""What kernels do alone, and the steps in Python, are the same flight."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
+from scenarios.files import load
+from scenarios.keys.link import Jitter, Link, Outage
+from scenarios.schema import Limits, Rates, Scenario
+from tests.support.paths import SCENARIOS
+
+WILD = {
+    "jitter": Jitter(distribution="normal", scale_s=0.012), "reordering": True,
+    "loss_probability": 0.05, "duplicate_probability": 0.03, "corrupt_probability": 0.02,
+}  # fmt: skip
+SILENT = {"outages": (Outage(from_s=2.0, until_s=4.5),)}
+
+
+@dataclass
+class StepByStep:
+    """Vehicles whose steps a driver cannot see through."""
+
+    vehicles: Vehicles
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        return self.vehicles.step(received, now_ns)
+
+
+class Counting(Station):
+    """A station that counts its steps in Python."""
+
+    steps = 0
+
+    def step(self, datagrams: Any, now_ns: int, taken: int = 0) -> Any:
+        self.steps += 1
+        return super().step(datagrams, now_ns, taken)
+
+
+def flown(plan: FlightPlan, *, step_by_step: bool) -> tuple[list[TickArray], list[Any], Counting]:
+    station, fleet = Counting(plan, start_ns=START_NS), vehicles_of(plan.scenario)
+    ticks: list[TickArray] = []
+    frames: list[Any] = []
+    for rows in fly_lockstep(plan, station=station, vehicles=StepByStep(fleet) if step_by_step else fleet):
+        ticks.append(rows)
+        frames += station.frames
+    return ticks, frames, station
+
+
+def changed(name: str, delay_s: float | None = None, link: dict[str, Any] | None = None, **changes: Any) -> Scenario:
+    def with_changes(own: Link) -> Link:
+        return own.model_copy(update=link or {})
+
+    scenario = load(SCENARIOS / f"{name}.toml").with_links(with_changes, with_changes)
+    if delay_s is not None:
+        scenario = scenario.with_link_delay(up_s=delay_s / 2, down_s=delay_s / 2)
+    return scenario.model_copy(update={"duration_s": 6.0, **changes})
+
+
+FLIGHTS = {
+    "calm": changed("triangle5"),
+    "coupled": changed("chain3_bidirectional"),
+    "wild links": changed("triangle5", link=WILD),
+    "slow telemetry": changed("triangle5", rates=Rates(control_hz=50.0, telemetry_hz=12.5)),
+    "limits": changed("triangle5_scattered", limits=Limits(acceleration_max_m_s2=0.5)),
+    "altitudes": changed("copters5", dynamics="double_integrator", response=None),
+    "gains change": changed("triangle5", 0.3, duration_s=25.0),
+    "silence": changed("chain3", link=SILENT),
+    "breaks": changed("triangle5", 0.6).with_calm_monitor(),
+}
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_kernels_alone_and_python_fly_the_same_flight(name: str) -> None:
+    plan = flight_plan(FLIGHTS[name])[1]
+    ticks, frames, station = flown(plan, step_by_step=False)
+    others, other_frames, other = flown(plan, step_by_step=True)
+    assert [rows.tobytes() for rows in ticks] == [rows.tobytes() for rows in others]
+    assert frames == other_frames
+    assert station.events == other.events
+    assert (station.counters, station.end_reason) == (other.counters, other.end_reason)
+    if name == "calm":
+        assert station.steps < 0.2 * other.steps
