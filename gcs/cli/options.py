@@ -130,7 +130,7 @@ def say_if_first_flight() -> None:
     from scenarios.kernel import any_kept
 
     if sys.stderr.isatty() and not any_kept():
-        print("first flight on this machine: compiling what runs for every frame, about 20 s", file=sys.stderr)
+        print("first flight on this machine: compiling what runs for every frame, half a minute", file=sys.stderr)
 
 
 def refuse(file: Path, *findings: str | None) -> None:

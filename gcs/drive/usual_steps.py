@@ -18,6 +18,7 @@ from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
 from sim_vehicles.drive.fleet import Fleet, FleetArrays
 from sim_vehicles.links.queue import copy_bytes
+from sim_vehicles.links.truth import can_record
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.vehicles.plain import step_all
 
@@ -150,7 +151,7 @@ def _step(ends: Any, now_ns: int, is_usual: bool, time_s: float, north_m_s: floa
         wire.sent[: state.sent_bytes], _columns(wire.to, state.sent),
         fleet.waiting, fleet.leaving, fleet.leaving_data, 0, now_ns,
     )  # fmt: skip
-    if entered < state.sent or waiting or leaving == fleet.leaving.shape[1]:
+    if entered < state.sent or waiting or leaving == fleet.leaving.shape[1] or not can_record(fleet.truth):
         state.entered, state.waiting, state.leaving = entered, waiting, leaving
         return NOT_LEFT
     usual.schedule[0].now_ns = now_ns

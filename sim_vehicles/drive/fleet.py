@@ -219,9 +219,8 @@ class Fleet:
 
     @property
     def is_usual(self) -> bool:
-        """Whether `step` does nothing before `step_all`, and what leaves is not recorded."""
-        begun = self._links.zero_ns != NEVER_NS and self._external is None
-        return begun and not self._in_order and self._recorder is None
+        """Whether `step` does nothing before `step_all`."""
+        return self._links.zero_ns != NEVER_NS and self._external is None and not self._in_order
 
     @property
     def arrays(self) -> FleetArrays:

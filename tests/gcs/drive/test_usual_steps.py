@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from gcs.control.tick import TickArray
@@ -13,6 +14,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Outage
 from scenarios.schema import Limits, Rates, Scenario
+from sim_vehicles.links.truth import MemoryRecorder, Recorder
 from tests.support.paths import SCENARIOS
 
 WILD = {
@@ -42,8 +44,10 @@ class Counting(Station):
         return super().step(datagrams, now_ns, taken)
 
 
-def flown(plan: FlightPlan, *, step_by_step: bool) -> tuple[list[TickArray], list[Any], Counting]:
-    station, fleet = Counting(plan, start_ns=START_NS), vehicles_of(plan.scenario)
+def flown(
+    plan: FlightPlan, *, step_by_step: bool, recorder: Recorder | None = None
+) -> tuple[list[TickArray], list[Any], Counting]:
+    station, fleet = Counting(plan, start_ns=START_NS), vehicles_of(plan.scenario, recorder=recorder)
     ticks: list[TickArray] = []
     frames: list[Any] = []
     for rows in fly_lockstep(plan, station=station, vehicles=StepByStep(fleet) if step_by_step else fleet):
@@ -86,3 +90,12 @@ def test_kernels_alone_and_python_fly_the_same_flight(name: str) -> None:
     assert (station.counters, station.end_reason) == (other.counters, other.end_reason)
     if name == "calm":
         assert station.steps < 0.2 * other.steps
+
+
+def test_kernels_alone_record_the_same_truth() -> None:
+    plan, recorders = flight_plan(FLIGHTS["wild links"])[1], (MemoryRecorder(100), MemoryRecorder())
+    for recorder, step_by_step in zip(recorders, (False, True), strict=True):
+        flown(plan, step_by_step=step_by_step, recorder=recorder)
+    one, other = (np.sort(recorder.records) for recorder in recorders)
+    assert len(one) > 5_000
+    assert one.tobytes() == other.tobytes()
