@@ -23,7 +23,7 @@ from gcs.control.law import unblended
 from gcs.control.loop_delay import headroom
 from gcs.control.tick import Mode
 from gcs.station.modes import STATE, Observation, Policy, VehicleState, is_at_ease, next_state, policy_of
-from scenarios.kernel import Array, Record, Records, array_kernel, kernel
+from scenarios.kernel import Array, Record, Records, kernel
 from scenarios.schema import Monitor
 
 _AWAY = (Mode.FAILSAFE, Mode.LOST)
@@ -44,6 +44,10 @@ class Watched(NamedTuple):
     """Ticks of this flight so far, (1,)."""
     margins_s: FloatArray
     """How much of its loop delay each gain set tolerates, (n, sets)."""
+    in_order: FloatArray
+    """Room for the delays of a vehicle, (ticks,)."""
+    changed: NDArray[np.int64]
+    """Room for rows, (n,)."""
 
 
 class Seen(NamedTuple):
@@ -66,45 +70,54 @@ def _rank(seen: int) -> int:
     return min(seen - 1, int(0.9 * seen))
 
 
-@array_kernel
-def _judged_delays_s(delays_s: Array, judged: int) -> FloatArray:
-    """The delay by which each vehicle is judged."""
-    judged_s, seen = np.full(len(delays_s), nan), min(judged, delays_s.shape[1])
-    for row in range(len(delays_s)):
-        if seen:
-            judged_s[row] = np.partition(delays_s[row, :seen], _rank(seen))[_rank(seen)]
-    return judged_s
+@kernel
+def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> float:
+    """The delay by which a vehicle is judged."""
+    known = 0
+    for place in range(seen):
+        delay_s = delays_s[row, place]
+        if not isnan(delay_s):
+            later = known
+            while later > 0 and in_order[later - 1] > delay_s:
+                in_order[later] = in_order[later - 1]
+                later -= 1
+            in_order[later] = delay_s
+            known += 1
+    return in_order[_rank(seen)] if known > _rank(seen) >= 0 else nan
 
 
-@array_kernel
-def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> NDArray[np.int64]:
-    """Note the delays of a tick, and find the states after it; returns where mode, gain set or release changes."""
+@kernel
+def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
+    """Note the delays of a tick, and find the states after it.
+
+    Returns for how many vehicles the mode, the gain set or the release changes; their rows are in `changed`.
+    """
     states, after, delays_s, width = watched.states, watched.after, watched.delays_s, watched.delays_s.shape[1]
-    place = watched.judged[0] % width
+    place, found, largest_s = watched.judged[0] % width, 0, nan if separable else -inf
     watched.judged[0] = watched.judged[0] + 1 if seen.flying else 0  # before the flight the loop is not closed
+    known = min(watched.judged[0], width)
     for row in range(len(states)):
         after[row] = states[row]
         if seen.flying:
             delays_s[row, place] = seen.loop_delay_s[row]
-    known = min(watched.judged[0], width)
-    largest_s = nan if separable or not seen.flying else _judged_delays_s(delays_s, known).max()
-    rows, found = np.empty(len(states), np.int64), 0
+        if not separable:
+            delay_s = _judged_delay_s(delays_s, row, known, watched.in_order)
+            largest_s = nan if isnan(delay_s) or isnan(largest_s) else max(largest_s, delay_s)
     for row in range(len(states)):
-        margins_s = watched.margins_s[row]
-        if seen.flying and _is_calm(states[row], seen, row, delays_s[row, :known], largest_s, margins_s, policy):
+        margins_s, state, new = watched.margins_s[row], states[row], after[row]
+        if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, largest_s, margins_s, policy):
             continue
-        delay_s = _judged_delays_s(delays_s[row : row + 1], known)[0] if separable else largest_s
+        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else largest_s
         own = Observation(
             seen.time_s, seen.flying, seen.silent[row], seen.guided[row], seen.failsafe[row], delay_s
         )  # fmt: skip
-        state, new = states[row], after[row]
         new.mode, new.gain_set, new.former_set, new.changed_s, new.pressed_s, new.eased_s, new.released = next_state(
             state_of(state), own, margins_s, policy
         )
         if new.mode != state.mode or new.gain_set != state.gain_set or new.released != state.released:
-            rows[found] = row
+            watched.changed[found] = row
             found += 1
-    return rows[:found]
+    return found
 
 
 @kernel
@@ -118,19 +131,20 @@ def state_of(record: Record) -> VehicleState:
 
 @kernel
 def _is_calm(
-    state: Record, seen: Seen, row: int, delays_s: Array, largest_s: float, margins_s: Array, policy: Policy
-) -> bool:
+    state: Record, seen: Seen, row: int, delays_s: Array, seen_ticks: int, separable: bool, largest_s: float,
+    margins_s: Array, policy: Policy,
+) -> bool:  # fmt: skip
     """Whether a vehicle is heard, guided and at ease, and its headroom is enough or unknown: true of most ticks."""
     if seen.silent[row] or not seen.guided[row] or not is_at_ease(state):
         return False
     margin_s, caution = margins_s[state.gain_set], policy.caution_headroom
-    if not isnan(largest_s):
-        return _headroom(largest_s, margin_s) >= caution
+    if not separable:
+        return isnan(largest_s) or _headroom(largest_s, margin_s) >= caution
     known = enough = 0
-    for place in range(len(delays_s)):
-        known += not isnan(delays_s[place])
-        enough += _headroom(delays_s[place], margin_s) >= caution
-    rank = _rank(len(delays_s))
+    for place in range(seen_ticks):
+        known += not isnan(delays_s[row, place])
+        enough += _headroom(delays_s[row, place], margin_s) >= caution
+    rank = _rank(seen_ticks)
     return not (known > rank and enough <= rank)
 
 
@@ -178,7 +192,8 @@ class FormationMonitor:
         self.separable = separable
         self._period_s = period_s
         self._delays_s = np.full((vehicles, max(1, round(policy.window_s / period_s))), nan)
-        self._judged = np.zeros(1, np.int64)
+        self._judged, self._changed = np.zeros(1, np.int64), np.zeros(vehicles, np.int64)
+        self._in_order = np.zeros(self._delays_s.shape[1])
         self._troubled: dict[int, VehicleState] = {}
         """Those, by row, on whose account the formation may open."""
         self.newest_blends, self._settled_s = unblended(vehicles), -inf
@@ -191,7 +206,8 @@ class FormationMonitor:
     def update(self, seen: Seen) -> list[tuple[int, VehicleState, VehicleState]]:
         """Judge a tick. Returns row, old and new state of each vehicle whose mode, gain set or release changed."""
         changes: list[tuple[int, VehicleState, VehicleState]] = []
-        changed: list[int] = judge(self.watched, seen, self.policy, self.separable).tolist()
+        count = judge(self.watched, seen, self.policy, self.separable)
+        changed: list[int] = self._changed[:count].tolist()
         first = self._next_to_release() if changed else -1
         for row in changed:
             before, after = self._state(self._states, row), self._state(self._after, row)
@@ -228,7 +244,9 @@ class FormationMonitor:
 
     @property
     def watched(self) -> Watched:
-        return Watched(self._states, self._after, self._delays_s, self._judged, self.margins_s)
+        return Watched(
+            self._states, self._after, self._delays_s, self._judged, self.margins_s, self._in_order, self._changed
+        )  # fmt: skip
 
     def is_calm(self, time_s: float) -> bool:
         """Whether all vehicles fly, with the gains and the spacing that they keep."""
@@ -242,11 +260,8 @@ class FormationMonitor:
 
     def _next_to_release(self) -> int:
         """The vehicle that may be released now: the CRITICAL one farthest down the tree; -1 if there is none."""
-        for row in range(len(self.states) - 1, -1, -1):
-            state = self.states[row]
-            if not state.released and state.mode is Mode.CRITICAL:
-                return row
-        return -1
+        critical = (self._states["mode"] == Mode.CRITICAL) & ~self._states["released"]
+        return int(critical.nonzero()[0].max(initial=-1))
 
     def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""

@@ -23,7 +23,7 @@ from gcs.station.modes import Policy
 from gcs.station.monitor import Seen, Watched, judge, settle
 from gcs.station.reception import NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
 from gcs.station.tick_rows import Judged, fill
-from scenarios.kernel import Array, Records, array_kernel
+from scenarios.kernel import Array, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
 
 HEARTBEAT_NS = 1_000_000_000
@@ -60,10 +60,11 @@ class Scratch(NamedTuple):
     points: Records
     """Of `gcs.link.mavlink.SET_POINT`."""
     rtt_s: FloatArray
+    silent: NDArray[np.bool_]
 
 
 def new_scratch(n: int) -> Scratch:
-    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n))
+    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_))
 
 
 class Usual(NamedTuple):
@@ -94,6 +95,7 @@ class Usual(NamedTuple):
     """This and the rest: see `Scratch`."""
     points: Records
     rtt_s: FloatArray
+    silent: NDArray[np.bool_]
 
 
 class Due(NamedTuple):
@@ -171,15 +173,15 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
     return ask(known, clocks, pending_ns, first, due, schedule.now_ns)
 
 
-@array_kernel
+@kernel
 def _is_calm(usual: Usual, time_s: float) -> bool:
     """Whether the monitor has nothing to do but to note delays and times, which is done only then."""
     limits, n = usual.limits[0], len(usual.used_s)
-    silent = np.zeros(n, np.bool_)
+    silent = usual.silent
     for row in range(n):
         silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
     seen = Seen(time_s, True, silent, usual.guided, usual.critical, usual.used_s)
-    if len(judge(usual.watched, seen, usual.policy, limits.separable)):
+    if judge(usual.watched, seen, usual.policy, limits.separable) > 0:
         usual.watched.judged[0] -= 1
         return False
     settle(usual.watched)
