@@ -1,7 +1,7 @@
 """The mode and the gain set of one vehicle, as its headroom changes: `monitored` is the whole decision.
 
-As headroom shrinks, the vehicle's gains change to slower sets, and it is released to its failsafe last; when the link
-recovers, these actions are undone in the reverse order. What it takes for each is in one table.
+As headroom shrinks, the vehicle's gains change to slower sets; last, it is released to its failsafe. When the link
+recovers, these actions are undone in the reverse order. One table says what each takes.
 """
 
 from math import inf
@@ -135,7 +135,7 @@ def next_state(state: VehicleState, seen: Observation, margins_s: Array, policy:
 def _by_headroom(
     state: VehicleState, own: float, faster: float, slowest: int, policy: Policy, now_s: float
 ) -> VehicleState:
-    """The rows of the table that depend on headroom: of the set flown, and of the next faster one."""
+    """The rows of the table that depend on headroom: `own` is h there, and `faster` is h+."""
     last_resort = state.gain_set == slowest and state.mode == _CRITICAL and not state.released
     pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
     eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)

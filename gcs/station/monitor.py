@@ -188,7 +188,7 @@ class FormationMonitor:
         """How much of its loop delay each gain set tolerates, (vehicles, sets)."""
         self.opening = 1.0
         """Factor on the formation's spacing."""
-        self.policy, self._opens = policy_of(policy), policy
+        self.policy, self._keys = policy_of(policy), policy
         self.separable = separable
         self._period_s = period_s
         self._delays_s = np.full((vehicles, max(1, round(policy.window_s / period_s))), nan)
@@ -250,7 +250,7 @@ class FormationMonitor:
 
     def is_calm(self, time_s: float) -> bool:
         """Whether all vehicles fly, with the gains and the spacing that they keep."""
-        may_open = self._opens.act and self._troubled
+        may_open = self._keys.act and self._troubled
         return time_s >= self._settled_s and self.opening == 1.0 and not may_open and not self.away
 
     @property
@@ -267,9 +267,9 @@ class FormationMonitor:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
         slowest = self.margins_s.shape[1] - 1
         settled_s = time_s - self.policy.blend_s  # gives the slowest gains time to take effect
-        wide = self._opens.act and any(
+        wide = self._keys.act and any(
             s.gain_set == slowest and s.changed_s < settled_s for s in self._troubled.values()
         )
-        goal = self._opens.open_factor if wide and flying else 1.0
-        step = (self._opens.open_factor - 1.0) * self._period_s / self._opens.open_s
+        goal = self._keys.open_factor if wide and flying else 1.0
+        step = (self._keys.open_factor - 1.0) * self._period_s / self._keys.open_s
         self.opening += min(step, max(-step, goal - self.opening))
