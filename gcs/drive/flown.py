@@ -64,12 +64,12 @@ def fly_plan(
         writer = RunWriter(folder)
     rows: list[TickArray] = []
     vehicles = vehicles_of(plan.scenario, recorder=recorder)
-    for tick in fly_lockstep(plan, station=station, vehicles=vehicles):
-        rows.append(tick)
+    for ticks in fly_lockstep(plan, station=station, vehicles=vehicles, ahead=writer is None):
+        rows.append(ticks)
         if writer is not None:
-            writer.tick(tick)
+            writer.tick(ticks)
             writer.frames(station.frames)
-    events = [*station.events, Event(time_s=float(rows[-1]["time_s"][0]), kind=END, text=station.end_reason)]
+    events = [*station.events, Event(time_s=float(rows[-1]["time_s"][-1]), kind=END, text=station.end_reason)]
     if writer is not None:
         writer.event(*events)
         writer.close()

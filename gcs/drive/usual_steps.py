@@ -12,7 +12,7 @@ import numpy as np
 from gcs.control.tick import TICK, TickArray
 from gcs.link.datagram import Address, Arrivals
 from gcs.station.station import Station
-from gcs.station.usual import DONE, NOT_DUE, NOT_JUDGED, WITH_TICK, Due, Sending, Usual, usual_step
+from gcs.station.usual import DONE, DUE, NOT_JUDGED, WITH_TICK, Due, Sending, Usual, usual_step
 from scenarios.kernel import Columns, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
@@ -22,18 +22,21 @@ from sim_vehicles.links.truth import can_record
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.vehicles.plain import step_all
 
-NOT_LEFT = -1
-"""How far a step came, beside what `usual_step` returns: not all that leaves the vehicles' links has left."""
-_USUAL = DONE, WITH_TICK, NOT_JUDGED
+NOT_LEFT, PAUSED = -1, -2
+"""How far steps came, beside what `usual_step` returns: not all that leaves the vehicles' links has left; all is done,
+but Python has to take what there is of rows and datagrams."""
 _STEPS = 4
 """Steps whose datagrams there is room for."""
+_MOST_TICKS, _MOST_ROWS = 32, 1024
+"""Ticks that are flown at a time, if nobody needs to see them one by one."""
 _WIRE = np.dtype(
     [
         ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams that have not been passed on
         ("in_step", "i8"), ("taken", "i8"),  # those of the last step, and how many of these the station has taken in
         ("sent", "i8"), ("sent_bytes", "i8"),  # datagrams that enter the links in the next step
         ("entered", "i8"), ("waiting", "i8"), ("leaving", "i8"),  # what `step_all` returned
-        ("next_ns", "i8"),  # when the next step is due
+        ("now_ns", "i8"), ("next_ns", "i8"),  # of the last step, and when the next is due
+        ("ticks", "i8"),  # those done in this call
     ]
 )  # fmt: skip
 
@@ -49,8 +52,10 @@ class Wire(NamedTuple):
     sent: Bytes
     to: Ints
     """The table of what is sent."""
+    due: Records
+    """Of DUE: what is known of the next ticks."""
     rows: Records
-    """Those of the last tick."""
+    """Those of the ticks done, in order."""
 
 
 class Ends(NamedTuple):
@@ -74,48 +79,55 @@ class Stopped(NamedTuple):
 
 
 class UsualSteps:
-    """The usual steps of a station and a fleet. `addresses` are those of the fleet's vehicles, `places` see `Ends`."""
+    """The usual steps of a station and a fleet. `addresses` are those of the fleet's vehicles, `places` see `Ends`.
 
-    def __init__(self, station: Station, fleet: Fleet, addresses: Sequence[Address], places: Ints) -> None:
+    With `ahead`, several ticks are flown before their rows are passed on, and received frames are not.
+    """
+
+    def __init__(
+        self, station: Station, fleet: Fleet, addresses: Sequence[Address], places: Ints, *, ahead: bool
+    ) -> None:
         self._station, self._fleet, self._addresses, self._places = station, fleet, addresses, places
-        most = _STEPS * fleet.most_leaving
+        most, n = _STEPS * fleet.most_leaving, len(places)
         self._none_queued = np.zeros(most, np.int64)
-        self._room = most - fleet.most_leaving
+        self._room, self._ahead = most - fleet.most_leaving, ahead
         arrived, sent = np.zeros((2, most * FRAME_BYTES), np.uint8)
         arrivals, to = np.zeros((2, 4, most), np.int64)
-        self._wire = Wire(np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.empty(len(places), TICK))
+        ticks = max(1, min(_MOST_TICKS, _MOST_ROWS // n)) if ahead else 1
+        self._wire = Wire(
+            np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(ticks, DUE), np.empty(ticks * n, TICK)
+        )
         self._state = Columns(self._wire.state)
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
+        self._tick_bytes = n * TICK.itemsize
 
     def fly(self, entering: Datagrams) -> Generator[TickArray, None, Stopped]:
-        """Do steps until one is not usual, which is returned; yields the rows of each control tick.
+        """Do steps until one is not usual, which is returned; yields the rows of the control ticks.
 
         `entering` is what the station has sent.
         """
         from scenarios.handle import handle  # with Numba, which most commands need not load
 
-        station, wire, arrived, next_ns = self._station, self._wire, self._state["arrived"], self._state["next_ns"]
+        station, wire, state = self._station, self._wire, self._state
         now_ns = station.next_event_ns
         if entering.stream.size > wire.sent.size or len(entering) > wire.to.shape[1]:
             return Stopped(now_ns, self._fleet.step(entering, now_ns), 0)
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
-        self._state["sent"][0], self._state["sent_bytes"][0] = len(entering), entering.stream.size
+        state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
         ends = handle(Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire))
-        next_tick_ns = station.next_tick_ns
+        arrived, ticks = state["arrived"], state["ticks"]
         while True:
-            due = NOT_DUE if now_ns < next_tick_ns else station.due
-            how_far = _step(ends, now_ns, due.is_usual, due.time_s, *due.nominal_velocity_m_s)
-            if how_far not in _USUAL:
-                return self._stopped(how_far, now_ns)
-            if how_far != DONE:
+            how_far = _fly(ends, station.look_ahead(wire.due), self._room, self._ahead)
+            if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
-                rows = self._row_bytes.copy().view(TICK) if how_far == WITH_TICK else None
-                yield station.complete(station.unjudged(due), [now_ns]) if rows is None else rows
+            if ticks[0]:
+                yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
+            if how_far == NOT_JUDGED:
+                yield station.complete(station.unjudged(wire.due["time_s"][ticks[0]]), [state["now_ns"][0]])
+            if how_far not in (PAUSED, NOT_JUDGED):
+                return self._stopped(how_far, state["now_ns"][0])
+            if ticks[0] or how_far == NOT_JUDGED:
                 station.frames.clear()
-                next_tick_ns = station.next_tick_ns
-            elif arrived[0] > self._room:
-                self._pass_on(arrived[0])
-            now_ns = next_ns[0]
 
     def _pass_on(self, count: int) -> None:
         """Pass so many datagrams that have arrived, the first ones, on to the station's frames."""
@@ -142,10 +154,36 @@ class UsualSteps:
 
 
 @array_kernel
-def _step(ends: Any, now_ns: int, is_usual: bool, time_s: float, north_m_s: float, east_m_s: float) -> int:
-    """One step, as far as it is usual; returns how far it came. `ends` is a handle on `Ends`; the rest is as `Due`."""
-    fleet, usual, places, senders, wire = ends.arrays
+def _fly(ends: Any, known: int, room: int, ahead: bool) -> int:
+    """Do steps as far as they are usual, up to the last of the `known` ticks; returns how far they came.
+
+    `ends` is a handle on `Ends`. There is room for the datagrams of a further step while no more than `room` have
+    arrived; with `ahead` nobody wants those of earlier steps.
+    """
+    wire = ends.arrays[-1]
     state = wire.state[0]
+    state.ticks = 0
+    while True:
+        if state.arrived > room:
+            if not ahead:
+                return PAUSED
+            state.arrived = state.arrived_bytes = 0
+        state.now_ns = state.next_ns
+        how_far = _step(ends, known)
+        if how_far == WITH_TICK:
+            state.ticks += 1
+            if state.ticks == known:
+                return PAUSED
+        elif how_far != DONE:
+            return how_far
+
+
+@array_kernel
+def _step(ends: Any, known: int) -> int:
+    """One step, as far as it is usual; returns how far it came."""
+    fleet, usual, places, senders, wire = ends.arrays
+    state, n = wire.state[0], len(places)
+    now_ns, ticks = state.now_ns, state.ticks
     entered, waiting, leaving = step_all(
         fleet.vehicles, fleet.links, fleet.entries, fleet.frames, fleet.draws, fleet.truth,
         wire.sent[: state.sent_bytes], _columns(wire.to, state.sent),
@@ -156,12 +194,14 @@ def _step(ends: Any, now_ns: int, is_usual: bool, time_s: float, north_m_s: floa
         return NOT_LEFT
     usual.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
-    due = Due(is_usual, time_s, (north_m_s, east_m_s))
-    queued_ns = np.zeros(leaving, np.int64)
-    how_far, state.taken, first, second = usual_step(usual, wire.arrived, table, queued_ns, senders, due, wire.rows)
+    next_tick = wire.due[min(ticks, len(wire.due) - 1)]
+    due = Due(ticks < known, next_tick.time_s, (next_tick.north_m_s, next_tick.east_m_s))
+    queued_ns, rows = np.zeros(leaving, np.int64), wire.rows[ticks * n : (ticks + 1) * n]
+    how_far, state.taken, first, second, third = usual_step(usual, wire.arrived, table, queued_ns, senders, due, rows)
     state.sent = state.sent_bytes = 0
     _send(wire, first, places, now_ns)
     _send(wire, second, places, now_ns)
+    _send(wire, third, places, now_ns)
     schedule = usual.schedule[0]
     state.next_ns = min(schedule.next_tick_ns, schedule.next_heartbeat_ns, schedule.next_requests_ns)
     return how_far

@@ -279,8 +279,8 @@ def _crc_step(crc: int, byte: int) -> int:
     return crc >> 8 ^ mixed << 8 ^ mixed << 3 ^ mixed >> 4
 
 
-_CRC = np.array([[_crc_step(0, byte) for byte in range(256)]] * 4)
-"""Row k: what a byte with k more behind it adds to the checksum."""
+_CRC = np.array([[_crc_step(0, byte) for byte in range(256)]] * 4, np.uint16)
+"""Row k: what a byte with k more behind it adds to the checksum. Short numbers: a kernel holds them as text."""
 for _further in range(1, 4):
     _CRC[_further] = _CRC[_further - 1] >> 8 ^ _CRC[0, _CRC[_further - 1] & 0xFF]
 
@@ -291,7 +291,7 @@ def checksum(data: Array, begin: int, end: int, extra: int) -> int:
     crc, fours = 0xFFFF, begin + (end - begin) // 4 * 4
     for k in range(begin, fours, 4):  # the four lookups do not wait for one another
         ahead = _CRC[3, (crc ^ data[k]) & 0xFF] ^ _CRC[2, (crc >> 8 ^ data[k + 1]) & 0xFF]
-        crc = ahead ^ _CRC[1, data[k + 2]] ^ _CRC[0, data[k + 3]]
+        crc = int64(ahead ^ _CRC[1, data[k + 2]] ^ _CRC[0, data[k + 3]])
     for k in range(fours, end):
         crc = crc >> 8 ^ _CRC[0, (crc ^ data[k]) & 0xFF]
     return crc >> 8 ^ _CRC[0, (crc ^ extra) & 0xFF]
@@ -402,12 +402,13 @@ def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDAr
     return frames
 
 
-REQUEST_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES
+TIMESYNC_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES
 
 
 @kernel
-def encode_request(data: Array, ts1_ns: int, sequence: int) -> int:
-    """Write the frame of a TIMESYNC request into `REQUEST_FRAME_BYTES` zeros; returns its length."""
+def encode_timesync(data: Array, tc1_ns: int, ts1_ns: int, sequence: int) -> int:
+    """Write the frame of a TIMESYNC, a request if tc1 is 0, into `TIMESYNC_FRAME_BYTES` zeros; returns its length."""
+    _put(data, _HEADER_BYTES, np.uint64(tc1_ns), 8)
     _put(data, _HEADER_BYTES + 8, np.uint64(ts1_ns), 8)
     end = len(data) - 2
     while end > _HEADER_BYTES + 1 and not data[end - 1]:

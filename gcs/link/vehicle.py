@@ -33,7 +33,7 @@ from gcs.link.kinds import (
     commanded_mode,
     mode_command,
 )
-from gcs.link.mavlink import REQUEST_FRAME_BYTES, encode_request
+from gcs.link.mavlink import TIMESYNC_FRAME_BYTES, encode_timesync
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
 from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
 from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, kernel
@@ -140,7 +140,7 @@ def ask(
     known: Records, clocks: Records, pending_ns: Array, first: int, count: int, now_ns: int
 ) -> tuple[Array, Array, Array]:
     """Note the requests; returns their frames, the sizes of these and the rows."""
-    frames = np.zeros((count, REQUEST_FRAME_BYTES), np.uint8)
+    frames = np.zeros((count, TIMESYNC_FRAME_BYTES), np.uint8)
     sizes, rows, place = np.empty(count, np.int64), np.empty(count, np.int64), 0
     for turn in range(first, first + count):
         row = turn % len(known)
@@ -149,7 +149,7 @@ def ask(
         rows[place] = row
         known[row].sequence = (known[row].sequence + 1) & 0xFF
         ts1_ns = request(clocks[row], pending_ns[row], now_ns)
-        sizes[place] = encode_request(frames[place], ts1_ns, known[row].sequence)
+        sizes[place] = encode_timesync(frames[place], 0, ts1_ns, known[row].sequence)
         place += 1
     return frames[:place], sizes[:place], rows[:place]
 

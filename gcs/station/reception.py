@@ -1,6 +1,6 @@
 """Takes datagrams in: what vehicles sent, and what follows from it for their clocks, their states and their start-up.
 
-Nearly all datagrams hold one LOCAL_POSITION_NED, the reply to a TIMESYNC request, or a heartbeat like the last one. One
+Nearly all datagrams hold one LOCAL_POSITION_NED, a TIMESYNC, or a heartbeat like the last one. One
 kernel takes all of these, up to the first datagram that is anything else; that one is read frame by frame, by the same
 kernels where they apply.
 """
@@ -50,10 +50,11 @@ REPORTED = np.dtype(
     ]
 )
 """What came with a vehicle's newest state."""
-_ORDER, _DELIVERY, _JUMP, _EXCHANGE = range(4)
+_ORDER, _DELIVERY, _JUMP, _EXCHANGE, ANSWER = range(5)
 _NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8")])
 """What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _DELIVERY: tell the loop the
-one-way delay (value_ns) of what was sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns."""
+one-way delay (value_ns) of what was sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns; ANSWER:
+the request sent_ns that came at value_ns."""
 NEWS_OF_A_FRAME = 3
 
 
@@ -271,6 +272,8 @@ class Reception:
                 self.touched.add(row)
                 vehicle.begin_anew()
                 self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
+            elif kind == ANSWER:
+                vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=value_ns, ts1_ns=sent_ns), outgoing)
             else:
                 vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=value_ns), outgoing)
 
@@ -336,7 +339,7 @@ def _take_frame(
     if msg_id == LOCAL_POSITION_NED:
         known = isfinite(sum(state))
     elif msg_id == TIMESYNC:
-        known = tc1_ns != 0  # a reply
+        known = tc1_ns != 0 or link.launched  # a reply, or a request
     elif msg_id == HEARTBEAT:
         same = link.heartbeat != 0 and unsigned_at(stream, payload, 8, payload_end) == link.heartbeat
         known = link.launched and same and received_ns - link.heartbeat_ns <= FORGET_NUMBERS_NS
@@ -357,7 +360,11 @@ def _take_frame(
         boot_ms = int64(unsigned_at(stream, payload, 4, payload_end))
         _take_position(tables, row, boot_ms, state, received_ns, queued_ns, now)
     elif msg_id == TIMESYNC:
-        _take_reply(tables, row, tc1_ns, int64(unsigned_at(stream, payload + 8, 8, payload_end)), received_ns, now)
+        ts1_ns = int64(unsigned_at(stream, payload + 8, 8, payload_end))
+        if tc1_ns:
+            _take_reply(tables, row, tc1_ns, ts1_ns, received_ns, now)
+        else:
+            _note(tables, ANSWER, row, received_ns, ts1_ns)
     elif msg_id == HEARTBEAT and order == NEW:
         link.heartbeat_ns = received_ns
     return True

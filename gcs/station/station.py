@@ -33,9 +33,7 @@ from gcs.station.tick_rows import Judged, Tick, tick_rows
 from gcs.station.usual import (
     HEARTBEAT_NS,
     LIMITS,
-    NOT_DUE,
     SCHEDULE,
-    Due,
     Usual,
     commanded,
     new_scratch,
@@ -185,33 +183,44 @@ class Station:
         """See `Reception.numbered`."""
         return self._reception.numbered(addresses)
 
-    @property
-    def due(self) -> Due:
-        """What usual steps need to know of the next tick."""
-        scenario, time_s = self.plan.scenario, self.scenario_time_s(self.next_tick_ns)
-        waiting = self._journal.stop or self._reception.touched or self._busy or self._gone or self._returning
-        calm = self._breakage.all_back and self._monitor.is_calm(time_s)
-        if self.phase is not Phase.FLYING or waiting or not calm or self._waited_s >= scenario.duration_s:
-            return NOT_DUE
-        return Due(True, time_s, scenario.nominal_velocity_at(time_s))
+    def look_ahead(self, ticks: Records) -> int:
+        """Fill in what usual steps need to know of the next ticks (k, DUE), as many as there may be usual ones.
 
-    def unjudged(self, due: Due) -> Tick:
-        """The tick of a usual step that did not judge it, for `complete`."""
+        Returns how many these are. They are usual only as long as no step in Python comes between.
+        """
+        scenario, next_ns, time_s = self.plan.scenario, self.next_tick_ns, self.scenario_time_s(self.next_tick_ns)
+        waiting = self._journal.stop or self._reception.touched or self._busy or self._gone or self._returning
+        if (
+            self.phase is not Phase.FLYING
+            or waiting
+            or not self._breakage.all_back
+            or not self._monitor.is_calm(time_s)
+        ):
+            return 0
+        for place in range(len(ticks)):
+            due_ns = next_ns + place * self._period_ns
+            if self._waited_s(due_ns) >= scenario.duration_s:
+                return place
+            time_s = self.scenario_time_s(due_ns)
+            ticks[place] = time_s, *scenario.nominal_velocity_at(time_s)
+        return len(ticks)
+
+    def unjudged(self, time_s: float) -> Tick:
+        """The tick at a scenario time of a usual step that did not judge it, for `complete`."""
         due_ns, rtt_s = self._columns["now_ns"][0], self._scratch.rtt_s
         self._journal.now_ns = due_ns
         controls, nobody = self._scratch.controls.copy(), np.zeros(len(self.vehicles), np.int64)
         followed = commanded(controls, self._monitor.released, True)
         judged = self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
-        return Tick(self._tick_count - 1, due.time_s, due_ns, self._key_ms(due_ns), judged, nobody)
+        return Tick(self._tick_count - 1, time_s, due_ns, self._key_ms(due_ns), judged, nobody)
 
     def _key_ms(self, due_ns: int) -> int:
         """The `time_boot_ms` of the set-points of a tick."""
         return (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
 
-    @property
-    def _waited_s(self) -> float:
-        """How long the phase will have lasted at the next tick."""
-        return (self.next_tick_ns - self._phase_since_ns) / NS_PER_S
+    def _waited_s(self, due_ns: int) -> float:
+        """How long the phase will have lasted at a tick."""
+        return (due_ns - self._phase_since_ns) / NS_PER_S
 
     def _judged(
         self, controls: Records, rtt_s: FloatArray, followed: NDArray[np.bool_], tolerated: Tolerances, due_ns: int
@@ -374,7 +383,7 @@ class Station:
             self._busy.add(row)
 
     def _next_phase(self, due_ns: int) -> None:
-        waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
+        waited_s = self._waited_s(due_ns)
         if self.phase is Phase.CONNECTING:
             self.request_stop(self._fleet.startup_failure(due_ns, self._start_ns, self._history))
         if self.phase is Phase.IDENTIFYING:

@@ -17,11 +17,18 @@ from gcs.control.law import CONTROL, PackedLaw, control_all, nearest_of
 from gcs.control.limits import any_beyond, shorten
 from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import accelerations
-from gcs.link.mavlink import HEARTBEAT_EXTRA, SET_POINT, same_frames, set_point_frames
+from gcs.link.mavlink import (
+    HEARTBEAT_EXTRA,
+    SET_POINT,
+    TIMESYNC_FRAME_BYTES,
+    encode_timesync,
+    same_frames,
+    set_point_frames,
+)
 from gcs.link.vehicle import ask, heard
 from gcs.station.modes import Policy
 from gcs.station.monitor import Seen, Watched, judge, settle
-from gcs.station.reception import NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
+from gcs.station.reception import ANSWER, NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
 from gcs.station.tick_rows import Judged, fill
 from scenarios.kernel import Array, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
@@ -98,17 +105,17 @@ class Usual(NamedTuple):
     silent: NDArray[np.bool_]
 
 
+DUE = np.dtype([("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")])
+"""What Python knows of a tick to come: its scenario time, and the nominal velocity then."""
+
+
 class Due(NamedTuple):
-    """What Python knows of the tick that is due next."""
+    """The same of the tick that is due next, for kernels."""
 
     is_usual: bool
-    """Whether a kernel may do it, as far as Python knows."""
-    time_s: float = 0.0
-    """Scenario time."""
-    nominal_velocity_m_s: tuple[float, float] = (0.0, 0.0)
-
-
-NOT_DUE = Due(False)
+    """Whether a kernel may do it, as far as Python knows. If not, nothing else is known."""
+    time_s: float
+    nominal_velocity_m_s: tuple[float, float]
 
 
 class Sending(NamedTuple):
@@ -122,7 +129,7 @@ class Sending(NamedTuple):
 @array_kernel
 def usual_step(
     usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Due, rows: Records
-) -> tuple[int, int, Sending, Sending]:
+) -> tuple[int, int, Sending, Sending, Sending]:
     """Do a step at `now_ns` of the schedule as far as it is usual.
 
     Stream, table and `queued_ns` are those of `Arrivals`. Returns how far it came, how many datagrams are taken in, and
@@ -131,18 +138,21 @@ def usual_step(
     schedule, tables = usual.schedule[0], usual.tables
     nothing, taken = _nothing(), 0
     if NEWS_OF_A_FRAME * table.shape[1] > len(tables.news):
-        return NOT_TAKEN, taken, nothing, nothing
+        return NOT_TAKEN, taken, nothing, nothing, nothing
     now = Now(schedule.now_ns, schedule.start_ns, schedule.period_ns, False)
     taken = take_usual(tables, stream, table, queued_ns, 0, usual.row_of, senders, now)
     if taken < table.shape[1]:
-        return NOT_TAKEN, taken, nothing, nothing
-    if tables.news_count[0]:
-        return NOT_DONE, taken, nothing, nothing
+        return NOT_TAKEN, taken, nothing, nothing, nothing
+    for place in range(tables.news_count[0]):
+        if tables.news[place].kind != ANSWER:
+            return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
         if not due.is_usual or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due.time_s):
-            return NOT_DONE, taken, nothing, nothing
+            return NOT_DONE, taken, nothing, nothing, nothing
+        answers = _answered(tables)
         set_points, judged = _tick(usual, due, rows)
-        return (WITH_TICK if judged else NOT_JUDGED), taken, set_points, nothing
+        return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
+    answers = _answered(tables)
     heartbeats = requests = nothing
     known = tables.links
     if schedule.now_ns >= schedule.next_heartbeat_ns:
@@ -153,7 +163,25 @@ def usual_step(
     if schedule.now_ns >= schedule.next_requests_ns:
         frames, sizes, to = requested(usual.schedule, known, tables.clocks, tables.pending_ns)
         requests = Sending(frames, sizes, to)
-    return DONE, taken, heartbeats, requests
+    return DONE, taken, answers, heartbeats, requests
+
+
+@array_kernel
+def _answered(tables: Tables) -> Sending:
+    """Answer the requests of vehicles, which are the only news."""
+    count = tables.news_count[0]
+    frames, sizes, rows = (
+        np.zeros((count, TIMESYNC_FRAME_BYTES), np.uint8),
+        np.empty(count, np.int64),
+        np.empty(count, np.int64),
+    )
+    for place in range(count):
+        news = tables.news[place]
+        link = tables.links[news.row]
+        link.sequence = (link.sequence + 1) & 0xFF
+        sizes[place], rows[place] = encode_timesync(frames[place], news.value_ns, news.sent_ns, link.sequence), news.row
+    tables.news_count[0] = 0
+    return Sending(frames, sizes, rows)
 
 
 @array_kernel

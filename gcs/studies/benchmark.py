@@ -241,8 +241,9 @@ def _flight(plan: FlightPlan, *, timed: bool = False, key: Key | None = None) ->
     ends, guard = (vehicles_of(plan.scenario), None) if key is None else signed_ends(plan, key)
     vehicles = _Timed(ends) if timed else ends
     begun_s, used_s = time.perf_counter(), time.process_time()
-    ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))
+    rows = sum(map(len, fly_lockstep(plan, vehicles=vehicles, guard=guard, ahead=True)))
     taken_s, used_s = time.perf_counter() - begun_s, time.process_time() - used_s
+    ticks = rows // len(plan.formation.system_ids)
     own_s = vehicles.taken_s if isinstance(vehicles, _Timed) else nan
     return _Flown(
         ticks, min(1.0, used_s / taken_s), taken_s / ticks, (taken_s - own_s) / ticks, own_s / ticks

@@ -145,7 +145,7 @@ def fly_virtual(
             raise InputError(f"{scenario.name}: {unstable}")
         plan = without_actions(plan)
     station = Station(plan, start_ns=START_NS)
-    ticks = in_sequence([*fly_lockstep(plan, station=station)]).reshape(-1, len(station.vehicles))
+    ticks = in_sequence([*fly_lockstep(plan, station=station, ahead=True)]).reshape(-1, len(station.vehicles))
     if station.plan is not plan:
         design = described(design, station.plan)
     events = (*station.events, Event(time_s=float(ticks["time_s"][-1, 0]), kind=END, text=station.end_reason))

@@ -6,10 +6,12 @@ import numpy as np
 
 from scenarios.kernel import Columns, Records
 from sim_vehicles.services.clock import NEVER_NS
-from sim_vehicles.services.frames import GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION
+from sim_vehicles.services.frames import GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION, TIMESYNC
 
 NOBODY = -1
 """In place of the system id of a station."""
+NEVER_ASKED = -1
+"""In place of the `ts1` of a TIMESYNC request."""
 
 VEHICLE = np.dtype(
     [
@@ -20,9 +22,10 @@ VEHICLE = np.dtype(
         ("sequence", "i8"),  # number of the next frame
         ("clock_start_ns", "i8"), ("clock_offset_ns", "i8"), ("clock_drift_ppb", "i8"),  # BootClock
         # Schedule: the periodic reports in REPORTS, the next of them, and the next message of any other kind
-        ("due_ns", "i8", (3,)), ("due_ms", "i8", (3,)), ("number", "i8", (3,)), ("interval_us", "i8", (3,)),
+        ("due_ns", "i8", (4,)), ("due_ms", "i8", (4,)), ("number", "i8", (4,)), ("interval_us", "i8", (4,)),
         ("report", "i8"), ("report_ns", "i8"),
         ("other_ns", "i8"),
+        ("asked_ts1", "i8"),  # of its newest TIMESYNC request
         # Authority
         ("station", "i8"), ("heard_ns", "i8"), ("commanded_ns", "i8"),
         # FlightMode
@@ -36,13 +39,13 @@ VEHICLE = np.dtype(
         ("turn_rate_max_rad_s", "f8"),
         ("altitude_m", "f8"),
         # counters, until they are added to those of the vehicle
-        ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"),
+        ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"), ("timesync_replies", "i8"),
     ],
     align=True,
 )  # fmt: skip
-REPORTS = HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION
+REPORTS = HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION, TIMESYNC
 """The messages that vehicles report by themselves, in the order in which they are sent at one instant."""
-COUNTED = ("setpoints", "heartbeats", "timesync_requests")
+COUNTED = ("setpoints", "heartbeats", "timesync_requests", "timesync_replies")
 
 
 class Place(NamedTuple):
@@ -57,7 +60,7 @@ class Place(NamedTuple):
 def new_vehicles(n: int) -> Records:
     """Records of `VEHICLE` for n vehicles that have done nothing."""
     vehicles = np.zeros(n, VEHICLE)
-    vehicles["station"] = NOBODY
+    vehicles["station"], vehicles["asked_ts1"] = NOBODY, NEVER_ASKED
     for name in ("acts_ns", "due_ns", "report_ns", "other_ns", "deadline_ns"):
         vehicles[name] = NEVER_NS
     return vehicles

@@ -65,7 +65,7 @@ def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame, 
         return _take_setpoint(vehicle, frame, time_ns, truth)
     if number == HEARTBEAT:
         return _take_heartbeat(vehicle, frame, time_ns)
-    return _answer(vehicle, frame, time_ns, answer) if number == TIMESYNC else UNUSUAL
+    return _take_timesync(vehicle, frame, time_ns, answer) if number == TIMESYNC else UNUSUAL
 
 
 @kernel
@@ -109,13 +109,18 @@ def _take_heartbeat(vehicle: Record, frame: Frame, time_ns: int) -> int:
 
 
 @kernel
-def _answer(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
-    """Answer a TIMESYNC request to this vehicle or to all."""
+def _take_timesync(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
+    """Answer a TIMESYNC request to this vehicle or to all, or take in the reply to its own."""
     size = int(frame[1])
     target = frame[PAYLOAD + 16] if size > 16 else 0
-    if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0 or target not in (0, vehicle.wire_id):
+    if target not in (0, vehicle.wire_id):
         return UNUSUAL
     ts1 = read_int64(frame, PAYLOAD + 8, min(max(size - 8, 0), 8))
+    if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0:
+        if ts1 != vehicle.asked_ts1:
+            return UNUSUAL
+        vehicle.timesync_replies += 1
+        return SILENT
     tc1 = boot_ns(vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb, time_ns)
     vehicle.timesync_requests += 1
     return timesync(answer, vehicle, tc1 or 1, ts1)  # never 0, even at boot: that would make the reply a request
@@ -125,7 +130,7 @@ def _answer(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -> int:
 def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     """Make the report that is due, before any other event, and schedule the next; returns as `hear`."""
     k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
-    if REPORTS[k] != HEARTBEAT:
+    if REPORTS[k] == LOCAL_POSITION or REPORTS[k] == GLOBAL_POSITION:
         if _must_move(vehicle, time_ns):
             return MOVE_FIRST
         advance_to(vehicle, time_ns)
@@ -133,6 +138,10 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     if REPORTS[k] == GLOBAL_POSITION and not -pi < yaw < pi:
         return UNUSUAL
     schedule_report(vehicle, k, vehicle.number[k] + 1)
+    if REPORTS[k] == TIMESYNC:
+        clock = vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb
+        vehicle.asked_ts1 = boot_ns(clock[0], clock[1], clock[2], time_ns)
+        return timesync(frame, vehicle, 0, vehicle.asked_ts1)
     if REPORTS[k] == HEARTBEAT:
         mode, critical = vehicle.mode, vehicle.stopped != 0
         return heartbeat(frame, vehicle, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)

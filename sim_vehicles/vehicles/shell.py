@@ -12,6 +12,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from scenarios import schema
+from scenarios.kernel import Cell
 from scenarios.networks import wire_id
 from sim_vehicles.links.truth import ACTED, SAMPLED, Recorder, rows_of
 from sim_vehicles.motion.double_integrator import State
@@ -149,16 +150,18 @@ Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the typ
 class Shell(Generic[Flown]):
     """A vehicle as its link sees it. `experiment` is the text of its parameter SCENARIO."""
 
+    _asked_ts1 = Cell[int]()
+
     def __init__(
         self, scenario: schema.Scenario, radio: Radio, craft: Flown, *, signed: bool = False, experiment: str = ""
     ) -> None:
         self.system_id = radio.system_id
         self.craft = craft
         self.radio = radio
+        _, self._columns, self._row = radio.place
         self.changes = radio.changes
         self.authority = Authority(radio.place, scenario.safety.heartbeat_timeout_s)
         self._speaks_version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
-        self._timesync_ts1 = -1
         self._frames = np.zeros((2, FRAME_BYTES), np.uint8)
         """A datagram, and the frame that a kernel makes."""
         self._backdating_ns = backdating_ns(scenario, radio.system_id)
@@ -218,8 +221,8 @@ class Shell(Generic[Flown]):
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
         if message_id == mavlink.TIMESYNC:
-            self._timesync_ts1 = radio.clock.boot_ns(time_ns)
-            frame = radio.encoder.timesync(0, self._timesync_ts1)
+            self._asked_ts1 = radio.clock.boot_ns(time_ns)
+            frame = radio.encoder.timesync(0, self._asked_ts1)
         elif message_id == PARAMETER_VALUE:
             frame = self.services.next_parameter(time_ns)
         else:
@@ -296,7 +299,7 @@ class Shell(Generic[Flown]):
             tc1 = self.radio.clock.boot_ns(time_ns) - next(self._backdating_ns, 0) or 1
             self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
         else:  # an unrequested reply is for another vehicle, or a duplicate
-            asked = message.ts1 == self._timesync_ts1
+            asked = message.ts1 == self._asked_ts1
             self.radio.counters["timesync_replies" if asked else "ignored_timesync_reply"] += 1
 
     def _obey(self, message: mavlink.Asked, time_ns: int) -> None:

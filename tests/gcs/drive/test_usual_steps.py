@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -45,12 +45,13 @@ class Counting(Station):
 
 
 def flown(
-    plan: FlightPlan, *, step_by_step: bool, recorder: Recorder | None = None
+    plan: FlightPlan, *, step_by_step: bool = False, ahead: bool = False, recorder: Recorder | None = None
 ) -> tuple[list[TickArray], list[Any], Counting]:
     station, fleet = Counting(plan, start_ns=START_NS), vehicles_of(plan.scenario, recorder=recorder)
     ticks: list[TickArray] = []
     frames: list[Any] = []
-    for rows in fly_lockstep(plan, station=station, vehicles=StepByStep(fleet) if step_by_step else fleet):
+    vehicles = StepByStep(fleet) if step_by_step else fleet
+    for rows in fly_lockstep(plan, station=station, vehicles=vehicles, ahead=ahead):
         ticks.append(rows)
         frames += station.frames
     return ticks, frames, station
@@ -82,14 +83,26 @@ FLIGHTS = {
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_kernels_alone_and_python_fly_the_same_flight(name: str) -> None:
     plan = flight_plan(FLIGHTS[name])[1]
-    ticks, frames, station = flown(plan, step_by_step=False)
+    ticks, frames, station = flown(plan)
     others, other_frames, other = flown(plan, step_by_step=True)
     assert [rows.tobytes() for rows in ticks] == [rows.tobytes() for rows in others]
     assert frames == other_frames
     assert station.events == other.events
     assert (station.counters, station.end_reason) == (other.counters, other.end_reason)
     if name == "calm":
-        assert station.steps < 0.2 * other.steps
+        assert station.steps < 0.15 * other.steps
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_a_flight_ahead_of_its_caller_has_the_same_rows(name: str) -> None:
+    plan = flight_plan(FLIGHTS[name])[1]
+    ticks, _, station = flown(plan, ahead=True)
+    others, _, other = flown(plan)
+    assert in_sequence(ticks).tobytes() == in_sequence(others).tobytes()
+    if name == "calm":
+        assert len(ticks) < 0.3 * len(others)
+    assert station.events == other.events
+    assert (station.counters, station.end_reason) == (other.counters, other.end_reason)
 
 
 def test_kernels_alone_record_the_same_truth() -> None:
