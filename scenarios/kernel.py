@@ -136,14 +136,14 @@ def _cache(wanted: str) -> Path | None:
     return folder if os.access(folder, os.W_OK) else None
 
 
-class Columns(dict[str, memoryview]):
+class Columns(dict[str, Any]):
     """The fields of a structured array by name: a number in one is read in 40 ns, in a record in 500 ns."""
 
     def __init__(self, records: Records) -> None:
         super().__init__()
         self._records = records
 
-    def __missing__(self, name: str) -> memoryview:
+    def __missing__(self, name: str) -> Any:
         self[name] = column = memoryview(self._records[name])
         return column
 

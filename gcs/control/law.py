@@ -293,7 +293,7 @@ def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArra
         north[row], east[row] = state[0] + state[2] * age_s, state[1] + state[3] * age_s
     least, one, two = inf, 0, 0
     along = north if np.ptp(north) > np.ptp(east) else east  # sorted by this, those far away need no look
-    order = np.argsort(along)
+    order = np.argsort(along, kind="mergesort")  # compiled in half the time of the default
     for place in range(n):
         row = order[place]
         for way in (-1, 1):

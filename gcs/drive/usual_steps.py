@@ -97,7 +97,7 @@ class UsualSteps:
         self._wire = Wire(
             np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(ticks, DUE), np.empty(ticks * n, TICK)
         )
-        self._state = Columns(self._wire.state)
+        self._state, self._due, self._most_ticks = Columns(self._wire.state), Columns(self._wire.due), ticks
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
         self._tick_bytes = n * TICK.itemsize
 
@@ -117,13 +117,13 @@ class UsualSteps:
         ends = handle(Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire))
         arrived, ticks = state["arrived"], state["ticks"]
         while True:
-            how_far = _fly(ends, station.look_ahead(wire.due), self._room, self._ahead)
+            how_far = _fly(ends, station.look_ahead(self._due, self._most_ticks), self._room, self._ahead)
             if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
             if ticks[0]:
                 yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
             if how_far == NOT_JUDGED:
-                yield station.complete(station.unjudged(wire.due["time_s"][ticks[0]]), [state["now_ns"][0]])
+                yield station.complete(station.unjudged(self._due["time_s"][ticks[0]]), [state["now_ns"][0]])
             if how_far not in (PAUSED, NOT_JUDGED):
                 return self._stopped(how_far, state["now_ns"][0])
             if ticks[0] or how_far == NOT_JUDGED:

@@ -396,7 +396,8 @@ def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDAr
     frames = np.empty((len(rows), size), np.uint8)
     for place in range(len(rows)):
         row, own = rows[place], frames[place]
-        own[:] = frame
+        for k in range(size):  # `own[:] = frame` would bring two seconds of compilation for its error message
+            own[k] = frame[k]
         own[4] = sequences[row] = (sequences[row] + 1) & 0xFF
         _put(own, size - 2, np.uint64(checksum(own, 1, size - 2, extra)), 2)
     return frames

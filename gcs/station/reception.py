@@ -279,10 +279,10 @@ class Reception:
 
 
 @kernel
-def _note(tables: Tables, kind: int, row: int, value_ns: int, sent_ns: int) -> None:
-    news = tables.news[tables.news_count[0]]
+def _note(all_news: Records, count: Array, kind: int, row: int, value_ns: int, sent_ns: int) -> None:
+    news = all_news[count[0]]
     news.kind, news.row, news.value_ns, news.sent_ns = kind, row, value_ns, sent_ns
-    tables.news_count[0] += 1
+    count[0] += 1
 
 
 @array_kernel
@@ -352,7 +352,7 @@ def _take_frame(
     order = count(tables.counters[row], int64(stream[begin + 4]), received_ns)
     if order != NEW and not link.told >> order & 1:
         link.told |= 1 << order
-        _note(tables, _ORDER, row, order, 0)
+        _note(tables.news, tables.news_count, _ORDER, row, order, 0)
     link.newest = order == NEW
     if order == DUPLICATE:
         return True
@@ -364,7 +364,7 @@ def _take_frame(
         if tc1_ns:
             _take_reply(tables, row, tc1_ns, ts1_ns, received_ns, now)
         else:
-            _note(tables, ANSWER, row, received_ns, ts1_ns)
+            _note(tables.news, tables.news_count, ANSWER, row, received_ns, ts1_ns)
     elif msg_id == HEARTBEAT and order == NEW:
         link.heartbeat_ns = received_ns
     return True
@@ -395,7 +395,7 @@ def _take_position(
         if not (clock.lost or clock.doubtful_state):
             tables.telemetry_ns[row] = received_ns  # heard before the first exchange
         elif now.now_ns - clock.asked_ns >= now.period_ns:
-            _note(tables, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0)
+            _note(tables.news, tables.news_count, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0)
         return
     origin = tables.frame_ned_m[row]
     north, east = state[0] + origin[0], state[1] + origin[1]
@@ -421,7 +421,7 @@ def _take_reply(tables: Tables, row: int, tc1_ns: int, ts1_ns: int, received_ns:
         if now.tells:
             key_ms = (ts1_ns - now.start_ns) // 1_000_000
             delivered_ns = delivery_ns(link, clock, key_ms, now.start_ns + key_ms * 1_000_000)
-            _note(tables, _DELIVERY, row, delivered_ns, ts1_ns)
+            _note(tables.news, tables.news_count, _DELIVERY, row, delivered_ns, ts1_ns)
     if clock.jumps != jumps:
         tables.report_counts[row] = 0
-        _note(tables, _JUMP, row, 0, 0)
+        _note(tables.news, tables.news_count, _JUMP, row, 0, 0)

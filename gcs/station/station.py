@@ -183,27 +183,24 @@ class Station:
         """See `Reception.numbered`."""
         return self._reception.numbered(addresses)
 
-    def look_ahead(self, ticks: Records) -> int:
-        """Fill in what usual steps need to know of the next ticks (k, DUE), as many as there may be usual ones.
+    def look_ahead(self, ticks: Columns, most: int) -> int:
+        """Fill in what usual steps need to know of the next ticks, up to `most`; `ticks` are the columns of DUE.
 
-        Returns how many these are. They are usual only as long as no step in Python comes between.
+        Returns how many may be usual, which they are only as long as no step in Python comes between.
         """
-        scenario, next_ns, time_s = self.plan.scenario, self.next_tick_ns, self.scenario_time_s(self.next_tick_ns)
+        scenario, next_ns = self.plan.scenario, self.next_tick_ns
         waiting = self._journal.stop or self._reception.touched or self._busy or self._gone or self._returning
-        if (
-            self.phase is not Phase.FLYING
-            or waiting
-            or not self._breakage.all_back
-            or not self._monitor.is_calm(time_s)
-        ):
+        calm = self._breakage.all_back and self._monitor.is_calm(self.scenario_time_s(next_ns))
+        if self.phase is not Phase.FLYING or waiting or not calm:
             return 0
-        for place in range(len(ticks)):
+        times_s, north_m_s, east_m_s = ticks["time_s"], ticks["north_m_s"], ticks["east_m_s"]
+        for place in range(most):
             due_ns = next_ns + place * self._period_ns
             if self._waited_s(due_ns) >= scenario.duration_s:
                 return place
-            time_s = self.scenario_time_s(due_ns)
-            ticks[place] = time_s, *scenario.nominal_velocity_at(time_s)
-        return len(ticks)
+            times_s[place] = time_s = self.scenario_time_s(due_ns)
+            north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(time_s)
+        return most
 
     def unjudged(self, time_s: float) -> Tick:
         """The tick at a scenario time of a usual step that did not judge it, for `complete`."""
