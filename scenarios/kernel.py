@@ -59,8 +59,8 @@ class _Kernel:
 
     @cached_property
     def _for_kernels(self) -> Any:
-        """What kernels call: without the code by which Python would, which takes a sixth of the time to compile."""
-        return self._dispatcher(for_python=False)
+        """What kernels call: unless Python has, without the code by which it would, a sixth of the compilation."""
+        return self._compiled or self._dispatcher(for_python=False)
 
     def _compile(self) -> Callable[..., Any]:
         self._compiled = compiled = self._dispatcher(for_python=True)

@@ -106,9 +106,7 @@ class Reader:
         count, end, errors, empty = _read(np.asarray(descriptors, np.int64), self._most, *self._buffers)
         read_ns = time.monotonic_ns()
         stream, table = self._buffers[0][:end].copy(), self._buffers[1][:, :count].copy()
-        # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
-        stamps_ns = np.where(table[3] == 0, read_ns, table[3] + to_monotonic_ns)
-        table[3] = stamps_ns.clip(self._emptied_ns, read_ns)
+        _to_monotonic(table[3], to_monotonic_ns, self._emptied_ns, read_ns)
         if empty:
             self._emptied_ns = begin_ns
         return Batch(stream, table, read_ns, errors)
@@ -196,6 +194,17 @@ def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints)
                 errors += 1
         empty = empty and emptied
     return count, end, errors, empty
+
+
+@kernel
+def _to_monotonic(stamps_ns: Ints, offset_ns: int, emptied_ns: int, read_ns: int) -> None:
+    """Bring the stamps of datagrams, 0 where there is none, to the monotonic clock.
+
+    They jump if the wall clock is set, but nothing arrived before the sockets were last empty.
+    """
+    for k in range(len(stamps_ns)):
+        stamp_ns = stamps_ns[k] + offset_ns if stamps_ns[k] else read_ns
+        stamps_ns[k] = min(max(stamp_ns, emptied_ns), read_ns)
 
 
 @kernel

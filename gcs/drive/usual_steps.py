@@ -123,7 +123,9 @@ class UsualSteps:
             if ticks[0]:
                 yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
             if how_far == NOT_JUDGED:
-                yield station.complete(station.unjudged(self._due["time_s"][ticks[0]]), [state["now_ns"][0]])
+                nobody = np.zeros(len(self._places), np.int64)
+                tick = station.unjudged(self._due["time_s"][ticks[0]], state["now_ns"][0], nobody)
+                yield station.complete(tick, [tick.due_ns])
             if how_far not in (PAUSED, NOT_JUDGED):
                 return self._stopped(how_far, state["now_ns"][0])
             if ticks[0] or how_far == NOT_JUDGED:

@@ -79,8 +79,9 @@ class Frames:
 
     def add(self, arrivals: Arrivals, first: int = 0, stop: int | None = None) -> None:
         """Add the datagrams from the place `first` up to `stop`, each of one frame."""
-        some = first or stop is not None
-        self.parts.append(replace(arrivals, table=arrivals.table[:, first:stop]) if some else arrivals)
+        table = arrivals.table[:, first:stop]
+        if table.shape[1]:
+            self.parts.append(replace(arrivals, table=table))
 
     def take(self, other: "Frames") -> None:
         """Add all frames of another, which has none then."""

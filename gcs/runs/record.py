@@ -137,6 +137,8 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
     """The tables of the datagrams of each network."""
+    if len({network for _, _, network in arrivals.addresses}) == 1:
+        return {arrivals.addresses[0][2]: arrivals.table}
     numbers, places = np.unique(arrivals.table[2], return_inverse=True)
     networks = np.array([arrivals.addresses[number][2] for number in numbers.tolist()], np.int64)[places]
     return {network: arrivals.table[:, networks == network] for network in np.unique(networks).tolist()}

@@ -19,25 +19,28 @@ from gcs.control.own_law import LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
-from gcs.link.datagram import Address, Arrivals, Block, Datagram, Outbox
+from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import HEARTBEAT, SILENCE_S, RemoteVehicle, heartbeats_to, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
-from gcs.station.breakage import SURELY_WITHIN, Breakage, not_formed
+from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
 from gcs.station.monitor import FormationMonitor, Seen
 from gcs.station.reception import Reception
 from gcs.station.tick_rows import Judged, Tick, tick_rows
 from gcs.station.usual import (
+    DUE,
     HEARTBEAT_NS,
-    LIMITS,
     SCHEDULE,
+    Due,
     Usual,
     commanded,
+    limits_of,
     new_scratch,
     requested,
+    usual_set_points,
 )
 from scenarios.kernel import Cell, Columns, Records
 from scenarios.schema import NS_PER_S
@@ -78,9 +81,8 @@ class Station:
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._reception = Reception(self._fleet, journal.report, start_ns=start_ns, period_ns=self._period_ns)
         self._history = self._reception.history
-        self.frames, self.counters, self.is_another = (
-            self._reception.frames, self._reception.counters, self._reception.is_another
-        )  # fmt: skip
+        self.frames, self.counters = self._reception.frames, self._reception.counters
+        self.is_another, self.senders = self._reception.is_another, self._reception.numbered
         """See `Reception`."""
         self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
@@ -90,8 +92,7 @@ class Station:
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
-        self._start_ns = start_ns
-        self._phase_since_ns = start_ns
+        self._start_ns = self._phase_since_ns = start_ns
         self._schedule = np.zeros(1, SCHEDULE)
         self._columns, self._row = Columns(self._schedule), 0
         # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
@@ -105,21 +106,13 @@ class Station:
             self._schedule[name] = value
         self._repetitions = Repetitions(rates, n)
         self._used_s = np.full(n, nan)
-        self._scratch = new_scratch(n)
+        self._scratch, self._due = new_scratch(n), Columns(np.zeros(1, DUE))
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
         self._tolerated = None if measured else self._tolerances(np.zeros(n))
         """The tolerances of every tick, if they do not depend on a measured delay."""
-        safety, limits = scenario.safety, np.zeros(1, LIMITS)
-        limits["acceleration_m_s2"], limits["silence_ns"] = self._limits.acceleration_m_s2, SILENCE_S * NS_PER_S
-        limits["repetition_ns"], limits["has_slots"] = self._repetitions.longest_ns, self._has_slots
-        limits["separable"] = plan.separable
-        limits["spacing_m"], limits["collision_m"] = (
-            SURELY_WITHIN * safety.spacing_error_limit_m,
-            safety.collision_distance_m,
-        )
-        self._judged_by = limits
+        self._judged_by = limits_of(plan, self._limits.acceleration_m_s2, self._repetitions.longest_ns)
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
@@ -151,7 +144,8 @@ class Station:
         self._columns["now_ns"][0] = self._journal.now_ns = now_ns
         outgoing = self._reception.take(datagrams, now_ns, taken)
         if now_ns >= self.next_tick_ns:
-            return outgoing, self._tick(outgoing)  # set-points do not wait for what may come in a step of its own
+            # set-points do not wait for what may come in a step of its own
+            return outgoing, self._usual_tick(outgoing) or self._tick(outgoing)
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + HEARTBEAT_NS
             outgoing.add(heartbeats_to(self._fleet.links))
@@ -179,10 +173,6 @@ class Station:
         """Whether steps may be usual."""
         return self._fleet.is_usual and self._tolerated is not None
 
-    def senders(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
-        """See `Reception.numbered`."""
-        return self._reception.numbered(addresses)
-
     def look_ahead(self, ticks: Columns, most: int) -> int:
         """Fill in what usual steps need to know of the next ticks, up to `most`; `ticks` are the columns of DUE.
 
@@ -202,14 +192,14 @@ class Station:
             north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(time_s)
         return most
 
-    def unjudged(self, time_s: float) -> Tick:
-        """The tick at a scenario time of a usual step that did not judge it, for `complete`."""
-        due_ns, rtt_s = self._columns["now_ns"][0], self._scratch.rtt_s
-        self._journal.now_ns = due_ns
-        controls, nobody = self._scratch.controls.copy(), np.zeros(len(self.vehicles), np.int64)
+    def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
+        """A tick, flying, whose set-points kernels have made; the arguments are as in `Tick`."""
+        self._journal.now_ns = self._columns["now_ns"][0]
+        controls, rtt_s = self._scratch.controls.copy(), self._scratch.rtt_s
         followed = commanded(controls, self._monitor.released, True)
         judged = self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
-        return Tick(self._tick_count - 1, time_s, due_ns, self._key_ms(due_ns), judged, nobody)
+        number = (due_ns - self._start_ns) // self._period_ns
+        return Tick(number, time_s, due_ns, self._key_ms(due_ns), judged, indices)
 
     def _key_ms(self, due_ns: int) -> int:
         """The `time_boot_ms` of the set-points of a tick."""
@@ -251,6 +241,17 @@ class Station:
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
+    def _usual_tick(self, outgoing: Outbox) -> Tick | None:
+        """The tick due now if a kernel can do it, else None."""
+        due_ns, due = self.next_tick_ns, self._due
+        if not self.is_usual or not self.look_ahead(due, 1):
+            return None
+        time_s, *velocity_m_s = (due[name][0] for name in DUE.names or ())
+        done, set_points = usual_set_points(self.usual, Due(True, time_s, (velocity_m_s[0], velocity_m_s[1])))
+        if not done:
+            return None
+        return self.unjudged(time_s, due_ns, self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing))
+
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
         behind = (self._journal.now_ns - due_ns) // self._period_ns
@@ -272,7 +273,7 @@ class Station:
         points = self._fleet.set_points(orders, self.phase)
         self._limits.limit(points)  # last, so that it holds whoever computed them
         self._fleet.loop.sent(due_ns, points)
-        indices = self._send_set_points(points, key_ms, outgoing)
+        indices = self._add_set_points(set_points_to(self._fleet.links, points, self._targets, key_ms), outgoing)
         for row in self._in_turn(sorted(self._busy)):
             frame = self.vehicles[row].next_frame(self._journal.now_ns)
             if frame is not None and (address := self.vehicles[row].address) is not None:
@@ -286,11 +287,11 @@ class Station:
         self._tick_count += 1 + behind
         return tick
 
-    def _send_set_points(self, points: Records, key_ms: int, outgoing: Outbox) -> IntArray:
-        """Add the set-points to the datagrams to be sent; returns their indices there, -1 for none."""
-        sent, indices = set_points_to(self._fleet.links, points, self._targets, key_ms), np.full(len(points), -1)
-        indices[sent.rows] = np.arange(len(outgoing), len(outgoing) + len(sent.rows))
-        outgoing.add(sent)
+    def _add_set_points(self, set_points: Block, outgoing: Outbox) -> IntArray:
+        """Add set-points to the datagrams to be sent; returns their indices there, -1 for none."""
+        indices = np.full(len(self.vehicles), -1)
+        indices[set_points.rows] = np.arange(len(outgoing), len(outgoing) + len(set_points.rows))
+        outgoing.add(set_points)
         return indices
 
     def _tolerances(self, assumed_s: FloatArray) -> Tolerances:

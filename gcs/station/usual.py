@@ -25,12 +25,15 @@ from gcs.link.mavlink import (
     same_frames,
     set_point_frames,
 )
-from gcs.link.vehicle import ask, heard
+from gcs.link.vehicle import SILENCE_S, ask, heard
+from gcs.plan.flight_plan import FlightPlan
+from gcs.station.breakage import SURELY_WITHIN
 from gcs.station.modes import Policy
 from gcs.station.monitor import Seen, Watched, judge, settle
 from gcs.station.reception import ANSWER, NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
 from gcs.station.tick_rows import Judged, fill
-from scenarios.kernel import Array, Records, array_kernel, kernel
+from scenarios.kernel import Array, Record, Records, array_kernel, kernel
+from scenarios.schema import NS_PER_S
 from scenarios.sockets import Bytes, Ints
 
 HEARTBEAT_NS = 1_000_000_000
@@ -54,6 +57,18 @@ LIMITS = np.dtype(
     align=True,
 )  # fmt: skip
 """What a tick is judged by."""
+
+
+def limits_of(plan: FlightPlan, acceleration_m_s2: float, repetition_ns: int) -> Records:
+    """What the ticks of a plan are judged by, LIMITS (1,)."""
+    safety, limits = plan.scenario.safety, np.zeros(1, LIMITS)
+    limits[0] = (
+        acceleration_m_s2, SILENCE_S * NS_PER_S, repetition_ns, plan.separable,
+        SURELY_WITHIN * safety.spacing_error_limit_m, safety.collision_distance_m, plan.scenario.has_altitude_slots,
+    )  # fmt: skip
+    return limits
+
+
 DONE, WITH_TICK, NOT_TAKEN, NOT_DONE, NOT_JUDGED = range(5)
 """How far a step came: it is done; with the rows of its tick; only some of its datagrams are taken in; these are, but
 nothing else is done; it is done but for the rows of its tick, as the formation may be broken."""
@@ -217,25 +232,50 @@ def _is_calm(usual: Usual, time_s: float) -> bool:
 
 
 @array_kernel
-def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
-    """The tick due now; returns the set-points, and whether the rows are filled, as the formation is not broken."""
+def usual_set_points(usual: Usual, due: Due) -> tuple[bool, Sending]:
+    """Decide and command the tick due now; if it is not usual, False and nothing, and nothing is done."""
+    if not _is_calm(usual, due.time_s):
+        return False, _nothing()
+    set_points, _ = _command(usual, due)
+    return True, set_points
+
+
+@array_kernel
+def _command(usual: Usual, due: Due) -> tuple[Sending, NDArray[np.bool_]]:
+    """The set-points of the tick due now, and which vehicles are to follow the control law."""
     schedule, limits, tables, law = usual.schedule[0], usual.limits[0], usual.tables, usual.law
-    controls, points, due_ns, number = usual.controls, usual.points, schedule.now_ns, schedule.tick_count
-    schedule.next_tick_ns = due_ns + schedule.period_ns
-    schedule.tick_count = number + 1
+    controls, points, due_ns = usual.controls, usual.points, schedule.next_tick_ns
+    ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ones are skipped
+    schedule.next_tick_ns = due_ns + ticks * schedule.period_ns
+    schedule.tick_count += ticks
     north_m_s, east_m_s = due.nominal_velocity_m_s
     times_ns, states = every_newest(tables.reports, tables.report_counts)
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
     control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    orders = commanded(controls, usual.released, True)
-    accelerations(points, controls, orders)
+    followed = commanded(controls, usual.released, True)
+    accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
-    key_ms = (due_ns - schedule.start_ns) // 1_000_000 & 0xFFFFFFFF
     to = heard(tables.links, points.sent)
-    frames = set_point_frames(points, to, tables.links.sequence, usual.targets, key_ms)
-    sent = Sending(frames, np.full(len(to), frames.shape[1]), to)
-    usual.rtt_s[:] = take_fresh(tables.fresh_ns, tables.fresh_counts)
+    frames = set_point_frames(points, to, tables.links.sequence, usual.targets, _key_ms(schedule, due_ns))
+    rtt_s = take_fresh(tables.fresh_ns, tables.fresh_counts)
+    for row in range(len(rtt_s)):
+        usual.rtt_s[row] = rtt_s[row]
+    return Sending(frames, np.full(len(to), frames.shape[1]), to), followed
+
+
+@kernel
+def _key_ms(schedule: Record, due_ns: int) -> int:
+    """The `time_boot_ms` of the set-points of a tick."""
+    return (due_ns - schedule.start_ns) // 1_000_000 & 0xFFFFFFFF
+
+
+@array_kernel
+def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
+    """The tick due now; returns the set-points, and whether the rows are filled, as the formation is not broken."""
+    schedule, limits, tables, controls = usual.schedule[0], usual.limits[0], usual.tables, usual.controls
+    due_ns, number = schedule.next_tick_ns, schedule.tick_count
+    set_points, followed = _command(usual, due)
     repeated = repeated_s(usual.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
     down_m = np.empty(len(controls) if limits.has_slots else 0)
     for row in range(len(down_m)):
@@ -245,17 +285,17 @@ def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
     for row in range(len(near_m)):
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
     if closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m):
-        return sent, False
+        return set_points, False
     judged = Judged(
-        usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, orders,
+        usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, followed,
         usual.shorter_s, usual.watched.margins_s, repeated,
     )  # fmt: skip
     sent_ns = np.full(len(controls), due_ns)
     fill(
         rows, usual.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
-        number, due.time_s, due_ns, key_ms,
+        number, due.time_s, due_ns, _key_ms(schedule, due_ns),
     )  # fmt: skip
-    return sent, True
+    return set_points, True
 
 
 @array_kernel
