@@ -1,7 +1,7 @@
-"""Steps of plain vehicles and their station in virtual time that kernels do alone, in one call each.
+"""Steps of plain vehicles and their station in virtual time that kernels do alone, many in one call.
 
-In most flights these are all steps but for some each second, such as those in which a vehicle's mode changes. Where a
-kernel stops, the steps in Python go on from there (`gcs.drive.lockstep`).
+In most flights these are nearly all steps between start-up and end. Where the kernel stops, as when a vehicle's mode
+changes, a step in Python goes on from there (`gcs.drive.lockstep`).
 """
 
 from collections.abc import Generator, Sequence

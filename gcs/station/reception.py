@@ -148,6 +148,8 @@ class Reception:
     def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> Outbox:
         """Take datagrams in but for the first ones, which a kernel has taken; returns the answers to them."""
         outgoing = Outbox()
+        if not len(datagrams):
+            return outgoing
         arrivals = datagrams if isinstance(datagrams, Arrivals) else arrivals_of(datagrams)
         count, place = arrivals.table.shape[1], taken
         if taken:

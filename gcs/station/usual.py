@@ -1,8 +1,8 @@
-"""The usual step of a station in one kernel: nothing happens that Python has to see to.
+"""A station's usual step, and its usual tick, in one kernel each: nothing happens that Python has to see to.
 
 Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation in flight
-whose loop the station closes without prediction, with every vehicle heard, guided and at ease. It is made of the same
-kernels as the steps in Python, which take over wherever this one stops.
+whose loop the station closes without prediction, with every vehicle heard, guided and at ease. They are made of the
+same kernels as the steps in Python, which take over wherever these stop.
 """
 
 from math import inf, isfinite, isnan
