@@ -110,3 +110,8 @@ TICK = np.dtype(
 def in_sequence(ticks: Sequence[TickArray]) -> TickArray:
     """The rows of ticks, one after the other. Numpy copies bytes 20 times faster than records."""
     return np.concatenate([rows.view(np.uint8) for rows in ticks]).view(TICK)
+
+
+def chosen(rows: TickArray, which: NDArray[Any]) -> TickArray:
+    """Records by a mask or by indices, copied as bytes, too."""
+    return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize)))[which].view(rows.dtype)

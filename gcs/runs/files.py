@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from gcs.control.tick import TICK, Event, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray, chosen
 from gcs.errors import InputError, usable
 from gcs.plan.design import Design
 from gcs.published import Published
@@ -126,7 +126,7 @@ def by_vehicle(rows: Rows) -> defaultdict[int, Rows]:
     """The rows of each vehicle by its system id, in the order that they have; none for other ids."""
     order = rows["system_id"].argsort(kind="stable")
     system_ids, first = np.unique(rows["system_id"][order], return_index=True)
-    found = zip(system_ids.tolist(), np.split(rows[order], first[1:]), strict=False)
+    found = zip(system_ids.tolist(), np.split(chosen(rows, order), first[1:]), strict=False)
     return defaultdict(lambda: rows[:0], found)
 
 

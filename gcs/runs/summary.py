@@ -13,7 +13,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.own_law import BAD, BUDGET_SHARE, CALLS, LAW, OVER
-from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray, chosen
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
@@ -97,8 +97,8 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
 def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
     """The summary of a run, all but its files and what its vehicles refused."""
     commanded = ticks["tick"][ticks["commanded"]]
-    flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
-    sent = flown[flown["commanded"]]
+    flown = chosen(ticks, (ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1)))
+    sent = chosen(flown, flown["commanded"])
     said = {kind: [event.text for event in events if event.kind == kind] for kind in (record.END, record.FLEET)}
     reason = (said[record.END] or [SILENT_END])[-1]
     not_logged = tuple(
@@ -115,7 +115,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     for event in events:
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
-    late = sent[sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)]
+    late = chosen(sent, sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0))
     headroom_end = min(_medians(late, "headroom").values(), default=None)
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
@@ -220,7 +220,7 @@ def _vehicle(
     rows: TickArray, own: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
 ) -> VehicleSummary:
     """The figures of a vehicle from all its rows, and its own of the flight."""
-    sent = own[own["commanded"]]
+    sent = chosen(own, own["commanded"])
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
     margins_s, rtt, modes = sent["delay_margin_s"], estimate(rows["rtt_s"]), rows["mode"]
@@ -259,7 +259,7 @@ def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
 
     The skew is the slope between the first and the last offset, each of which is wrong by its bound at most.
     """
-    known = own[np.isfinite(own["clock_offset_s"])]
+    known = chosen(own, np.isfinite(own["clock_offset_s"]))
     if not known.size:
         nothing = dict.fromkeys(("offset_s", "bound_s", "skew_ppm", "skew_bound_ppm"))
         return Clock(status="unknown", samples=0, **nothing, jumps=len(jumps_s))
@@ -295,7 +295,7 @@ def _flown_spread(
     if predicted is None:
         return None
     from_s = scenario.nominal_velocity[-1].from_s + _DECAYS / predicted.decay_rate_1_s
-    flown = flown[flown["time_s"] >= from_s]
+    flown = chosen(flown, flown["time_s"] >= from_s)
     vehicles: list[VehicleFlownSpread] = []
     flown_of = by_vehicle(flown)
     for own in predicted.vehicles:

@@ -41,7 +41,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray, IntArray
 from gcs.control.limits import LARGEST_COMMAND_M_S2
-from gcs.control.tick import TickArray
+from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight, fly_plan, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
@@ -159,7 +159,7 @@ def linear_error_m_s(scenario: Scenario) -> float:
 
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
-    return ticks[np.isin(ticks["system_id"], system_ids) & ticks["commanded"] & (ticks["time_s"] >= 0.0)]
+    return chosen(ticks, np.isin(ticks["system_id"], system_ids) & ticks["commanded"] & (ticks["time_s"] >= 0.0))
 
 
 def _alike(rows: TickArray, others: TickArray) -> int:

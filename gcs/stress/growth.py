@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gcs.control.tick import TickArray
+from gcs.control.tick import TickArray, chosen
 
 DECAY_KEPT = 0.02
 """A motion is followed until it has shrunk to this share of its largest value. Rounding of the telemetry, which the
@@ -82,7 +82,7 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
     """
     columns: list[FloatArray] = []
     for system_id in system_ids:
-        rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] >= 0.0)]
+        rows = chosen(ticks, (ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] >= 0.0))
         boot_ms, first = np.unique(rows["sample_boot_ms"], return_index=True)
         rows, time_s = rows[first], (boot_ms - boot_ms[:1]) * 1e-3
         values = np.stack([rows[name] for name in CHANNELS], axis=1).astype(np.float64)

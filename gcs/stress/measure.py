@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gains.sampled.coupled_block import CoupledBlock, critical_block
+from gcs.control.tick import chosen
 from gcs.drive.flown import first_uses, fly_plan, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
@@ -84,7 +85,7 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     plan = plan_of(trial)
     flight = fly_plan(plan, real_time=trial.real_time, folder=folder)
     outcome = with_summary(plan, flight, outcome)
-    flown = flight.ticks[flight.ticks["time_s"] >= 0.0]
+    flown = chosen(flight.ticks, flight.ticks["time_s"] >= 0.0)
     delays_s = median_delays_s(flown, plan.formation.system_ids)
     loop = critical_block(plan_loops(plan), delays_s)
     loop_s, link_s, _ = _slowest(plan, loop, delays_s)
@@ -127,7 +128,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     delays_s = free_response.effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     probed = _loop_of(plan_loops(base), delays_s, trial.probe)
     _, link_s, waiting_s = _slowest(base, probed, delays_s)
-    past = free_response.past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]])
+    past = free_response.past_limits(base.scenario, chosen(calm.ticks, calm.ticks["commanded"]))
     outcome = replace(outcome, link_delay_s=link_s, waiting_s=round(waiting_s, 9), past_limits=past)
 
     def respond(amplitude: float) -> FreeResponse:

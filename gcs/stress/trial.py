@@ -16,7 +16,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
-from gcs.control.tick import TickArray
+from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight, margins_of
 from gcs.plan.flight_plan import FlightPlan, Responses, onboard_timing
 from gcs.plan.formation import plan_formation
@@ -174,12 +174,13 @@ def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
 
 def _trace(ticks: TickArray) -> list[float]:
     """The largest spacing error of all vehicles in each `TRACE_PERIOD_S` of the flight, to four digits."""
-    rows = ticks[(ticks["time_s"] >= 0.0) & (ticks["tick"] <= ticks["tick"][ticks["commanded"]].max(initial=-1))]
+    last = ticks["tick"][ticks["commanded"]].max(initial=-1)
+    rows = chosen(ticks, (ticks["time_s"] >= 0.0) & (ticks["tick"] <= last))
     error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
-    rows, error = rows[np.isfinite(error)], error[np.isfinite(error)]
+    times_s, error = rows["time_s"][np.isfinite(error)], error[np.isfinite(error)]
     if not error.size:
         return []
-    stretch = (rows["time_s"] / TRACE_PERIOD_S).astype(np.int64)
+    stretch = (times_s / TRACE_PERIOD_S).astype(np.int64)
     largest = np.zeros(int(stretch.max()) + 1)
     np.maximum.at(largest, stretch, error)
     return [float(f"{value:.4g}") for value in largest]
