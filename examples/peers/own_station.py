@@ -10,6 +10,7 @@ import numpy as np
 from plain import ordered, report
 
 from gcs.control.phases import Phase
+from gcs.drive.lockstep import prepare
 from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_ticks
@@ -21,6 +22,7 @@ from scenarios.schema import NS_PER_S
 def main() -> None:
     scenario, port, out = ordered()
     _, plan = flight_plan(scenario)
+    prepare(plan)
     writer, used_s = RunWriter(out.parent), list[float]()
     with StationSocket("127.0.0.1", port) as link, undisturbed(own_code=False):
         station = Station(plan, start_ns=clock_ns(), stopwatch_ns=time.perf_counter_ns)
