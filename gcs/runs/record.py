@@ -137,10 +137,11 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
     """The tables of the datagrams of each network."""
-    if len({network for _, _, network in arrivals.addresses}) == 1:
-        return {arrivals.addresses[0][2]: arrivals.table}
-    numbers, places = np.unique(arrivals.table[2], return_inverse=True)
-    networks = np.array([arrivals.addresses[number][2] for number in numbers.tolist()], np.int64)[places]
+    numbers = arrivals.table[2].tolist()
+    network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}  # of these, not of all ever seen
+    if len(set(network_of.values())) == 1:
+        return {network_of[numbers[0]]: arrivals.table}
+    networks = np.array([network_of[number] for number in numbers], np.int64)
     return {network: arrivals.table[:, networks == network] for network in np.unique(networks).tolist()}
 
 
