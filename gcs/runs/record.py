@@ -138,11 +138,13 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
     """The tables of the datagrams of each network."""
     numbers = arrivals.table[2].tolist()
-    network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}  # of these, not of all ever seen
-    if len(set(network_of.values())) == 1:
-        return {network_of[numbers[0]]: arrivals.table}
-    networks = np.array([network_of[number] for number in numbers], np.int64)
-    return {network: arrivals.table[:, networks == network] for network in np.unique(networks).tolist()}
+    # `addresses` may hold every sender heard so far, strangers too: look only at those of this table
+    network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}
+    networks = set(network_of.values())
+    if len(networks) == 1:
+        return {networks.pop(): arrivals.table}
+    of_rows = np.array([network_of[number] for number in numbers], np.int64)
+    return {network: arrivals.table[:, of_rows == network] for network in networks}
 
 
 @kernel
