@@ -202,7 +202,9 @@ def _ticks(
     fleet = vehicles if plain and isinstance(vehicles, Fleet) else None
     usual = None if fleet is None else UsualSteps(station, fleet, bridge.addresses, bridge.rows, ahead=ahead)
     while station.phase is not Phase.ENDED:
-        if usual is not None and fleet is not None and fleet.is_usual and isinstance(to_vehicles, Datagrams):
+        # only the first set-point, which begins the flight, is not usual for the vehicles
+        begun = fleet is not None and fleet.is_usual and (fleet.begun or station.phase is Phase.CONNECTING)
+        if usual is not None and begun and isinstance(to_vehicles, Datagrams):
             now_ns, arrived, taken = yield from usual.fly(to_vehicles)
         else:
             now_ns, taken = station.next_event_ns, 0

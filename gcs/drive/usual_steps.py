@@ -1,6 +1,6 @@
 """Steps of plain vehicles and their station in virtual time that kernels do alone, many in one call.
 
-In most flights these are nearly all steps between start-up and end. Where the kernel stops, as when a vehicle's mode
+In most flights these are nearly all steps. Where the kernel stops, as when a vehicle answers a command or its mode
 changes, a step in Python goes on from there (`gcs.drive.lockstep`).
 """
 
@@ -197,7 +197,7 @@ def _step(ends: Any, known: int) -> int:
     usual.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
     next_tick = wire.due[min(ticks, len(wire.due) - 1)]
-    due = Due(ticks < known, next_tick.time_s, (next_tick.north_m_s, next_tick.east_m_s))
+    due = Due(ticks < known, next_tick.flying, next_tick.time_s, (next_tick.north_m_s, next_tick.east_m_s))
     queued_ns, rows = np.zeros(leaving, np.int64), wire.rows[ticks * n : (ticks + 1) * n]
     how_far, state.taken, first, second, third = usual_step(usual, wire.arrived, table, queued_ns, senders, due, rows)
     state.sent = state.sent_bytes = 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -290,6 +291,24 @@ class RemoteVehicle:
     def idle(self) -> bool:
         """Whether `next_frame` has nothing to send until the vehicle says something."""
         return self._settled and self.goal is Goal.FLY
+
+    @property
+    def quiet_until_ns(self) -> float:
+        """Until when `next_frame` changes nothing, if its parameters are uploaded and it says nothing unusual.
+
+        Nor is it `silent` before. 0 if that is not known, infinity if it is so for good.
+        """
+        waiting = self._command
+        if self.address is None:
+            return inf
+        if waiting is None and not self.idle and (self.goal is Goal.FLY or self._wanted() is not None):
+            return 0
+        return min(inf if waiting is None else waiting.sent_ns + NS_PER_S, self.heard_ns + _SILENT_NS)
+
+    @property
+    def has_to_speak(self) -> bool:
+        """Whether it is not ready before it says something unusual."""
+        return not self.left_out and (self.address is None or self._next_step().command is not None)
 
     @property
     def ready(self) -> bool:

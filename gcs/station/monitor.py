@@ -248,10 +248,11 @@ class FormationMonitor:
             self._states, self._after, self._delays_s, self._judged, self.margins_s, self._in_order, self._changed
         )  # fmt: skip
 
-    def is_calm(self, time_s: float) -> bool:
-        """Whether all vehicles fly, with the gains and the spacing that they keep."""
-        may_open = self._keys.act and self._troubled
-        return time_s >= self._settled_s and self.opening == 1.0 and not may_open and not self.away
+    def is_calm(self, time_s: float, *, flying: bool) -> bool:
+        """Whether all vehicles fly, or none is to, with the gains and the spacing that they keep."""
+        if time_s < self._settled_s or self.opening != 1.0:
+            return False
+        return not flying or not (self._keys.act and self._troubled or self.away)
 
     @property
     def away(self) -> list[int]:

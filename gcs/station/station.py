@@ -5,7 +5,7 @@ or in virtual time, with the same bytes.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from math import hypot, nan
+from math import hypot, inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Orders
 from gcs.control.own_law import LawHooks
-from gcs.control.phases import Phase, next_phase, patience_s
+from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
@@ -72,7 +72,8 @@ class Station:
         self.plan = plan
         self.phase = Phase.CONNECTING
         self.end_reason = ""
-        self._journal = journal = Journal(start_ns, patience_s(scenario))
+        self._start_patience_s = patience_s(scenario)
+        self._journal = journal = Journal(start_ns, self._start_patience_s)
         self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
         """See `Journal`."""
         self._fleet = fleet_of(plan, journal.report, LawHooks(journal.request_stop, journal.note_law, stopwatch_ns))
@@ -178,19 +179,34 @@ class Station:
 
         Returns how many may be usual, which they are only as long as no step in Python comes between.
         """
-        scenario, next_ns = self.plan.scenario, self.next_tick_ns
-        waiting = self._journal.stop or self._reception.touched or self._busy or self._gone or self._returning
-        calm = self._breakage.all_back and self._monitor.is_calm(self.scenario_time_s(next_ns))
-        if self.phase is not Phase.FLYING or waiting or not calm:
+        scenario, next_ns, flying = self.plan.scenario, self.next_tick_ns, self.phase is Phase.FLYING
+        waiting = self._reception.touched or self._gone or self._returning
+        if waiting or not self._monitor.is_calm(self.scenario_time_s(next_ns), flying=flying):
             return 0
-        times_s, north_m_s, east_m_s = ticks["time_s"], ticks["north_m_s"], ticks["east_m_s"]
+        if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
+            return 0
+        quiet_until_ns = inf if flying else self._quiet_until_ns()
+        flies, times_s, north_m_s, east_m_s = (ticks[name] for name in DUE.names or ())
         for place in range(most):
             due_ns = next_ns + place * self._period_ns
-            if self._waited_s(due_ns) >= scenario.duration_s:
+            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= self._patience_s:
                 return place
-            times_s[place] = time_s = self.scenario_time_s(due_ns)
-            north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(time_s)
+            flies[place], times_s[place] = flying, self.scenario_time_s(due_ns)
+            north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(times_s[place])
         return most
+
+    def _quiet_until_ns(self) -> float:
+        """Until when nothing is done at ticks before and after the flight, unless a vehicle says something unusual.
+
+        0 if that is not known. See also `_patience_s`.
+        """
+        ends = self.phase is Phase.ENDING
+        waits = ends or (self.phase is Phase.CONNECTING and not self._journal.stop)
+        if not waits or len(self.vehicles) > _IN_A_TICK:
+            return 0
+        if not ends and not any(vehicle.has_to_speak for vehicle in self.vehicles):
+            return 0
+        return min(vehicle.quiet_until_ns for vehicle in self.vehicles)
 
     def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
         """A tick, flying, whose set-points kernels have made; the arguments are as in `Tick`."""
@@ -204,6 +220,13 @@ class Station:
     def _key_ms(self, due_ns: int) -> int:
         """The `time_boot_ms` of the set-points of a tick."""
         return (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
+
+    @property
+    def _patience_s(self) -> float:
+        """How long the phase lasts at most."""
+        if self.phase is Phase.FLYING:
+            return self.plan.scenario.duration_s
+        return END_PATIENCE_S if self.phase is Phase.ENDING else self._start_patience_s
 
     def _waited_s(self, due_ns: int) -> float:
         """How long the phase will have lasted at a tick."""
@@ -244,10 +267,10 @@ class Station:
     def _usual_tick(self, outgoing: Outbox) -> Tick | None:
         """The tick due now if a kernel can do it, else None."""
         due_ns, due = self.next_tick_ns, self._due
-        if not self.is_usual or not self.look_ahead(due, 1):
+        if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(due, 1):
             return None
-        time_s, *velocity_m_s = (due[name][0] for name in DUE.names or ())
-        done, set_points = usual_set_points(self.usual, Due(True, time_s, (velocity_m_s[0], velocity_m_s[1])))
+        _, time_s, *velocity_m_s = (due[name][0] for name in DUE.names or ())
+        done, set_points = usual_set_points(self.usual, Due(True, True, time_s, (velocity_m_s[0], velocity_m_s[1])))
         if not done:
             return None
         return self.unjudged(time_s, due_ns, self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing))
@@ -389,7 +412,7 @@ class Station:
             if self.plan is not self._fleet.plan:
                 self.plan = self._fleet.plan
                 self._tolerated = self._tolerated and self._tolerances(np.zeros(len(self.vehicles)))
-        if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
+        if self.phase is Phase.FLYING and (waited_s >= self._patience_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
         if self.phase is Phase.FLYING and not self._journal.stop:
             return

@@ -1,8 +1,9 @@
 """A station's usual step, and its usual tick, in one kernel each: nothing happens that Python has to see to.
 
-Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation in flight
-whose loop the station closes without prediction, with every vehicle heard, guided and at ease. They are made of the
-same kernels as the steps in Python, which take over wherever these stop.
+Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation whose
+loop the station closes without prediction: in flight with every vehicle heard, guided and at ease, before and after it
+while the station waits for answers. They are made of the same kernels as the steps in Python, which take over wherever
+these stop.
 """
 
 from math import inf, isfinite, isnan
@@ -120,8 +121,8 @@ class Usual(NamedTuple):
     silent: NDArray[np.bool_]
 
 
-DUE = np.dtype([("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")])
-"""What Python knows of a tick to come: its scenario time, and the nominal velocity then."""
+DUE = np.dtype([("flying", "?"), ("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")], align=True)
+"""What Python knows of a tick to come: whether the formation is flown, its scenario time, the nominal velocity then."""
 
 
 class Due(NamedTuple):
@@ -129,6 +130,7 @@ class Due(NamedTuple):
 
     is_usual: bool
     """Whether a kernel may do it, as far as Python knows. If not, nothing else is known."""
+    flying: bool
     time_s: float
     nominal_velocity_m_s: tuple[float, float]
 
@@ -162,7 +164,7 @@ def usual_step(
         if tables.news[place].kind != ANSWER:
             return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
-        if not due.is_usual or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due.time_s):
+        if not due.is_usual or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due):
             return NOT_DONE, taken, nothing, nothing, nothing
         answers = _answered(tables)
         set_points, judged = _tick(usual, due, rows)
@@ -217,15 +219,15 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 
 @kernel
-def _is_calm(usual: Usual, time_s: float) -> bool:
+def _is_calm(usual: Usual, due: Due) -> bool:
     """Whether the monitor has nothing to do but to note delays and times, which is done only then."""
-    limits, n = usual.limits[0], len(usual.used_s)
+    limits, n, judged = usual.limits[0], len(usual.used_s), usual.watched.judged[0]
     silent = usual.silent
     for row in range(n):
         silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
-    seen = Seen(time_s, True, silent, usual.guided, usual.critical, usual.used_s)
+    seen = Seen(due.time_s, due.flying, silent, usual.guided, usual.critical, usual.used_s)
     if judge(usual.watched, seen, usual.policy, limits.separable) > 0:
-        usual.watched.judged[0] -= 1
+        usual.watched.judged[0] = judged
         return False
     settle(usual.watched)
     return True
@@ -234,7 +236,7 @@ def _is_calm(usual: Usual, time_s: float) -> bool:
 @array_kernel
 def usual_set_points(usual: Usual, due: Due) -> tuple[bool, Sending]:
     """Decide and command the tick due now; if it is not usual, False and nothing, and nothing is done."""
-    if not _is_calm(usual, due.time_s):
+    if not _is_calm(usual, due):
         return False, _nothing()
     set_points, _ = _command(usual, due)
     return True, set_points
@@ -253,7 +255,7 @@ def _command(usual: Usual, due: Due) -> tuple[Sending, NDArray[np.bool_]]:
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
     control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    followed = commanded(controls, usual.released, True)
+    followed = commanded(controls, usual.released, due.flying)
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
@@ -284,7 +286,7 @@ def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
     closest_m = inf
     for row in range(len(near_m)):
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
-    if closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m):
+    if due.flying and (closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)):
         return set_points, False
     judged = Judged(
         usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, followed,

@@ -219,8 +219,13 @@ class Fleet:
 
     @property
     def is_usual(self) -> bool:
-        """Whether `step` does nothing before `step_all`."""
-        return self._links.zero_ns != NEVER_NS and self._external is None and not self._in_order
+        """Whether `step` does nothing before `step_all`, but for noticing that the flight has begun."""
+        return self._external is None and not self._in_order
+
+    @property
+    def begun(self) -> bool:
+        """Whether it is known when the time of the links began: by default at the station's first set-point."""
+        return self._links.zero_ns != NEVER_NS
 
     @property
     def arrays(self) -> FleetArrays:
