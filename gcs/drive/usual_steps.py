@@ -27,8 +27,9 @@ NOT_LEFT, PAUSED = -1, -2
 but Python has to take what there is of rows and datagrams."""
 _STEPS = 4
 """Steps whose datagrams there is room for."""
-_MOST_TICKS, _MOST_ROWS = 32, 1024
-"""Ticks that are flown at a time, if nobody needs to see them one by one."""
+_FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 32, 1024
+"""Ticks that are flown at a time, if nobody needs to see them one by one: at first, as there may soon be something for
+Python to do, and later."""
 _WIRE = np.dtype(
     [
         ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams that have not been passed on
@@ -115,9 +116,11 @@ class UsualSteps:
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
         ends = handle(Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire))
-        arrived, ticks = state["arrived"], state["ticks"]
+        arrived, ticks, most = state["arrived"], state["ticks"], _FIRST_TICKS
         while True:
-            how_far = _fly(ends, station.look_ahead(self._due, self._most_ticks), self._room, self._ahead)
+            self._fleet.make_ready()
+            how_far = _fly(ends, station.look_ahead(self._due, min(most, self._most_ticks)), self._room, self._ahead)
+            most *= 2
             if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
             if ticks[0]:
@@ -142,17 +145,16 @@ class UsualSteps:
         return self._wire.arrived[:size].copy(), self._wire.arrivals[:, first:stop].copy()
 
     def _stopped(self, how_far: int, now_ns: int) -> Stopped:
-        found = self._wire.state[0]
-        ids, count, in_step = self._fleet.system_ids, int(found["arrived"]), int(found["in_step"])
+        state = self._state
+        ids, count, in_step = self._fleet.system_ids, state["arrived"][0], state["in_step"][0]
         if how_far == NOT_LEFT:
             self._pass_on(count)
-            stream, table = self._wire.sent[: found["sent_bytes"]], self._wire.to[:, : found["sent"]]
-            entered, waiting, leaving = found[["entered", "waiting", "leaving"]].item()
-            entering = Datagrams(stream, table.copy(), ids)
-            return Stopped(now_ns, self._fleet.go_on(entering, entered, waiting, leaving, now_ns), 0)
+            stream, table = self._wire.sent[: state["sent_bytes"][0]], self._wire.to[:, : state["sent"][0]]
+            begun = (state[name][0] for name in ("entered", "waiting", "leaving"))
+            return Stopped(now_ns, self._fleet.go_on(Datagrams(stream, table.copy(), ids), *begun, now_ns), 0)
         arrived = Datagrams(*self._arrived(count - in_step, count), ids)
         self._pass_on(count - in_step)
-        return Stopped(now_ns, arrived, int(found["taken"]))
+        return Stopped(now_ns, arrived, state["taken"][0])
 
 
 @array_kernel

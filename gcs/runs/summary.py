@@ -5,6 +5,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,8 @@ _SKEW_SPAN_S = 1.0
 """A clock's skew is not estimated over a shorter time than this."""
 _DECAYS = 7.0
 """The initial errors are gone after this many time constants of the slowest motion: e^-7 of them are left."""
+Errors = tuple[FloatArray, FloatArray]
+"""Times (s) and the norm of an error of one vehicle: of spacing (m) or of velocity (m/s)."""
 SILENT_END = "interrupted: the station ended without recording why"
 
 
@@ -94,39 +97,65 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     return whole(there())
 
 
-def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
-    """The summary of a run, all but its files and what its vehicles refused."""
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The verdict on a flight and what it rests on. `flown` are the rows of the flight, `errors` by system id."""
+
+    verdict: str
+    reason: str
+    settling_time_s: float | None
+    headroom_end: float | None
+    not_logged: tuple[str, ...]
+    flown: TickArray
+    flown_of: Mapping[int, TickArray]
+    errors: dict[int, Errors]
+
+    @property
+    def spacing_errors_m(self) -> list[tuple[float, float]]:
+        """The largest and the last spacing error of each follower that has any."""
+        return [(float(error_m.max()), float(error_m[-1])) for _, error_m in self.errors.values() if error_m.size]
+
+
+def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judged:
+    """Judge a flight by its ticks and events; see `verdict`."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = chosen(ticks, (ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1)))
-    sent = chosen(flown, flown["commanded"])
-    said = {kind: [event.text for event in events if event.kind == kind] for kind in (record.END, record.FLEET)}
-    reason = (said[record.END] or [SILENT_END])[-1]
+    reason = ([event.text for event in events if event.kind == record.END] or [SILENT_END])[-1]
     not_logged = tuple(
         f"{event.text}, from {event.time_s:.2f} s on" for event in events if event.kind == record.LOG_ENDED
     )
-    ticks_of, flown_of = by_vehicle(ticks), by_vehicle(flown)
+    flown_of = by_vehicle(flown)
     errors = {
         v.system_id: _error(flown_of[v.system_id], "spacing_error_{}_m")
         for v in scenario.vehicles
         if v.follows is not None
     }
     settled = _settling_time_s(scenario, errors, flown_of)
+    late = chosen(flown, flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)))
+    headroom_end = min(_medians(late, "headroom").values(), default=None)
+    logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
+    found = verdict(reason, settled, headroom_end=headroom_end, logged=logged)
+    return Judged(found, reason, settled, headroom_end, not_logged, flown, flown_of, errors)
+
+
+def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
+    """The summary of a run, all but its files and what its vehicles refused."""
+    judged, ticks_of = judge(scenario, ticks, events), by_vehicle(ticks)
+    flown = judged.flown
+    sent = chosen(flown, flown["commanded"])
     jumps: dict[int | None, list[float]] = defaultdict(list)
     for event in events:
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
-    late = chosen(sent, sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0))
-    headroom_end = min(_medians(late, "headroom").values(), default=None)
-    logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
     slowest_s = max(delays_s.values(), default=None)
     longest_flown = int(np.bincount(sent["gain_set"], minlength=1).argmax())
     return Summary(
         scenario=scenario.name,
-        verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
-        reason=reason,
-        fleet=(said[record.FLEET] or [record.STARTED])[-1],
-        not_logged=not_logged,
+        verdict=judged.verdict,
+        reason=judged.reason,
+        fleet=([event.text for event in events if event.kind == record.FLEET] or [record.STARTED])[-1],
+        not_logged=judged.not_logged,
         loop=scenario.control.loop,
         prediction=scenario.control.prediction,
         delay_margin_s=design.delay_margin_s,
@@ -137,21 +166,21 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         at_loop_delay=figures_at(design, scenario, slowest_s, longest_flown),
         spread=_flown_spread(scenario, design, flown, delays_s),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
-        headroom_end=headroom_end,
-        settling_time_s=settled,
+        headroom_end=judged.headroom_end,
+        settling_time_s=judged.settling_time_s,
         distance_min_m=np.fmin.reduce(flown["nearest_m"], initial=np.nan),
         duration_s=flown["time_s"].max(initial=0.0),
         vehicles=tuple(
             _vehicle(
                 ticks_of[v.system_id],
-                flown_of[v.system_id],
+                judged.flown_of[v.system_id],
                 v.system_id,
-                errors.get(v.system_id),
+                judged.errors.get(v.system_id),
                 jumps_s=jumps[v.system_id],
             )
             for v in scenario.vehicles
         ),
-        control=_control(scenario, flown),
+        control=control_of(scenario, flown),
         refused=counts_of(events, REFUSED),
         mirror=counts_of(events, record.MIRROR),
         mode_changes=tuple(event for event in events if event.kind == "mode" and event.time_s >= 0),
@@ -163,10 +192,6 @@ def _medians(rows: TickArray, name: str) -> dict[int, float]:
     """The median of a column for each vehicle that has known values in it, by its system id."""
     columns = {system_id: own[name] for system_id, own in by_vehicle(rows[["system_id", name]]).items()}
     return {key: float(np.median(known)) for key, own in columns.items() if (known := own[np.isfinite(own)]).size}
-
-
-Errors = tuple[FloatArray, FloatArray]
-"""Times (s) and the norm of an error of one vehicle: of spacing (m) or of velocity (m/s)."""
 
 
 def verdict(
@@ -337,7 +362,7 @@ def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> F
     return shares
 
 
-def _control(scenario: Scenario, flown: TickArray) -> Control:
+def control_of(scenario: Scenario, flown: TickArray) -> Control:
     """Ticks flown, and deadline misses: the last set-point sent over half a period after it was due, or none at all."""
     ticks, first = np.unique(flown["tick"], return_index=True)
     last_ns = np.maximum.reduceat(flown["sent_ns"], first) if first.size else flown["sent_ns"]

@@ -252,7 +252,7 @@ class FormationMonitor:
         """Whether all vehicles fly, or none is to, with the gains and the spacing that they keep."""
         if time_s < self._settled_s or self.opening != 1.0:
             return False
-        return not flying or not (self._keys.act and self._troubled or self.away)
+        return not flying or not ((self._keys.act and self._troubled) or self.away)
 
     @property
     def away(self) -> list[int]:

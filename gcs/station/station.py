@@ -185,11 +185,11 @@ class Station:
             return 0
         if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
             return 0
-        quiet_until_ns = inf if flying else self._quiet_until_ns()
+        quiet_until_ns, patience_s = inf if flying else self._quiet_until_ns(), self._patience_s
         flies, times_s, north_m_s, east_m_s = (ticks[name] for name in DUE.names or ())
         for place in range(most):
             due_ns = next_ns + place * self._period_ns
-            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= self._patience_s:
+            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= patience_s:
                 return place
             flies[place], times_s[place] = flying, self.scenario_time_s(due_ns)
             north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(times_s[place])

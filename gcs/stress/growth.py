@@ -242,7 +242,8 @@ def _modes(values: FloatArray, most: int) -> ComplexArray | None:
     count = len(values)
     rows = min(count // 2, _LONGEST_HANKEL)
     windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
-    left, singular, _ = np.linalg.svd(windows.reshape(rows, -1), full_matrices=False)
+    # the left singular vectors of H = L Q are those of L, which is small
+    left, singular, _ = np.linalg.svd(np.linalg.qr(windows.reshape(rows, -1).T, mode="r").T)
     order = min(most, int(np.count_nonzero(singular > _RANK_FLOOR * singular[0])), rows - 1)
     if order == 0:
         return None

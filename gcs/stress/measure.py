@@ -33,7 +33,7 @@ from gcs.stress.trial import (
     is_modelled,
     plan_loops,
     plan_of,
-    with_summary,
+    with_verdict,
 )
 
 AMPLITUDES = (1.0, 0.03, 0.001)
@@ -84,7 +84,7 @@ def _needs_pair(trial: Trial) -> bool:
 def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     plan = plan_of(trial)
     flight = fly_plan(plan, real_time=trial.real_time, folder=folder)
-    outcome = with_summary(plan, flight, outcome)
+    outcome = with_verdict(plan, flight, outcome)
     flown = chosen(flight.ticks, flight.ticks["time_s"] >= 0.0)
     delays_s = median_delays_s(flown, plan.formation.system_ids)
     loop = critical_block(plan_loops(plan), delays_s)
@@ -162,7 +162,7 @@ def _with_response(
     outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
     for amplitude in amplitudes:
         response = respond(amplitude)
-        outcome = with_summary(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
+        outcome = with_verdict(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
         outcome = _with_growth(loop, response, outcome)
         if outcome.growth_1_s is not None:
             outcome = replace(outcome, verdict="unstable" if outcome.growth_1_s > 0.0 else "stable")

@@ -17,11 +17,11 @@ from gains.core.arrays import FloatArray
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray, chosen
-from gcs.drive.flown import Flight, margins_of
+from gcs.drive.flown import Flight
 from gcs.plan.flight_plan import FlightPlan, Responses, onboard_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.own_law import law_of
-from gcs.runs.summary import summarise
+from gcs.runs.summary import control_of, judge
 from scenarios.keys.own import BUILT_IN
 from scenarios.schema import Scenario
 
@@ -153,18 +153,18 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
     )
 
 
-def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
+def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
     """The outcome with the verdict of the flight, its spacing errors and the driver's lateness."""
-    summary = summarise(plan.scenario, margins_of(plan), flight.ticks, flight.events)
-    assert summary.control is not None
+    judged = judge(plan.scenario, flight.ticks, flight.events)
+    lateness_s = control_of(plan.scenario, judged.flown).lateness_s
     return replace(
         outcome,
-        verdict=summary.verdict,
-        reason=summary.reason,
-        spacing_error_max_m=summary.spacing_error_max_m,
-        spacing_error_final_m=summary.spacing_error_final_m,
-        lateness_s_p50=summary.control.lateness_s.p50,
-        lateness_s_p99=summary.control.lateness_s.p99,
+        verdict=judged.verdict,
+        reason=judged.reason,
+        spacing_error_max_m=finite(max((most_m for most_m, _ in judged.spacing_errors_m), default=None)),
+        spacing_error_final_m=finite(max((last_m for _, last_m in judged.spacing_errors_m), default=None)),
+        lateness_s_p50=lateness_s.p50,
+        lateness_s_p99=lateness_s.p99,
         steal_share=flight.steal_share,
         busy_share=flight.busy_share,
         ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.tobytes()).hexdigest(),

@@ -98,8 +98,8 @@ class Fleet:
         self._members: dict[int, _Member] = {}
         self._external: ExternallyFlown | None = None
         """The leader, until the flight begins, if somebody else flies it."""
-        self._links = LinkSet(scenario, start_ns, recorder=recorder)
         count = len(scenario.vehicles)
+        self._links = LinkSet(scenario, start_ns, recorder=recorder, most=count)
         self._vehicles = new_vehicles(count)
         self._columns = Columns(self._vehicles)
         self._waiting = np.zeros((count, 2), np.int64)
@@ -226,6 +226,10 @@ class Fleet:
     def begun(self) -> bool:
         """Whether it is known when the time of the links began: by default at the station's first set-point."""
         return self._links.zero_ns != NEVER_NS
+
+    def make_ready(self) -> None:
+        """See to it that kernels have random draws for some steps."""
+        self._links.draw()
 
     @property
     def arrays(self) -> FleetArrays:

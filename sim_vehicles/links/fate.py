@@ -19,8 +19,9 @@ from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
 
 MOST_FLIPS = 4
-BLOCK = 128
-"""Datagrams whose draws are made together: numpy takes as long for one as for a hundred."""
+BLOCK, BLOCKS = 128, 2
+"""Datagrams whose draws are made together, as numpy takes as long for one as for a hundred, and how many such blocks
+there are at a time: the next one is made before the last one is used up."""
 
 
 DRAW = np.dtype(

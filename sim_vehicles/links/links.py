@@ -91,7 +91,7 @@ class Link:
     """How many datagrams have neither come out nor been dropped."""
     plain = Cell[bool]()
     """Whether kernels alone can run it: no channel limits it, and it is the same at all times."""
-    _drawn = Cell[int]()
+    _drawn, _made = Cell[int](), Cell[int]()
     _barred = Cell[int]()
 
     def __init__(
@@ -120,6 +120,7 @@ class Link:
         self._stream = None
         if channel is not None or not constant(link):
             self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
+            self._made = 0
         own = self._behaviour
         self._delay_ns = own.points_ns[0][1]
         values = {"capacity": capacity, "random": self._stream is not None, "delay_ns": self._delay_ns}
@@ -189,11 +190,17 @@ class Link:
         due_ns, _, entered_ns, data, fate, queued_ns = entry
         return self.kind, self.system_id, message_id(data), time_ns, entered_ns, due_ns, fate, queued_ns
 
+    def draw(self) -> None:
+        """Make the next block of draws unless there is one."""
+        if self._stream is not None and self._made - self._drawn < BLOCK:
+            draws = self._queues.draws[self._row]
+            place = self._made % len(draws)
+            self._stream.fill(draws[place : place + BLOCK])
+            self._made += BLOCK
+
     def make_ready(self) -> None:
         """See to it that a datagram and a duplicate can enter: that there are draws, and room for them and records."""
-        if self._stream is not None and self._drawn == BLOCK:
-            self._stream.fill(self._queues.draws[self._row])
-            self._drawn = 0
+        self.draw()
         if not has_room(self._queues.entries):
             self._queues.grow()
         if self._queues.recorder is not None:
@@ -204,7 +211,8 @@ class Link:
         if fate & DROPPED and not fate & DUPLICATE:
             return
         if fate & truth.CORRUPTED:
-            draw, changed = self._queues.draws[self._row, self._drawn - 1], np.frombuffer(bytearray(data), np.uint8)
+            draws, changed = self._queues.draws[self._row], np.frombuffer(bytearray(data), np.uint8)
+            draw = draws[(self._drawn - 1) % len(draws)]
             flip(changed, len(data), draw["flips"], flips_of(self._behaviour.corrupt, float(draw["corrupt"])))
             data = changed.tobytes()
         self._long[self.entered, 0] = data
@@ -219,15 +227,21 @@ def row_of(number: int, kind: int) -> int:
 
 
 class LinkSet:
-    """The links of all vehicles of a scenario, with the channels they share and their common time."""
+    """The links of all vehicles of a scenario, with the channels they share and their common time.
 
-    def __init__(self, scenario: schema.Scenario, start_ns: int, *, recorder: Recorder | None = None) -> None:
+    `most` is how many vehicles can be asked for.
+    """
+
+    def __init__(
+        self, scenario: schema.Scenario, start_ns: int, *, recorder: Recorder | None = None, most: int = MOST_IN_NETWORK
+    ) -> None:
         self._links = scenario.links
         self._seed = scenario.seed
         self._channels: dict[tuple[str, int, int], Channel] = {}
         self._known = {channel.name: channel for channel in scenario.links.channels}
         self._pairs: dict[int, tuple[Link, Link]] = {}
-        self.queues = new_queues(2 * max(MOST_IN_NETWORK, len(scenario.vehicles)), recorder)
+        self._in_rows: list[Link] = []
+        self.queues = new_queues(2 * most, recorder)
         """Of all links, in the rows of `row_of`."""
         self.zero_ns = start_ns if scenario.links.times_from == "start" else NEVER_NS
         """Host time at which the links' time is 0; NEVER_NS before the flight has begun."""
@@ -241,14 +255,22 @@ class LinkSet:
         """The (up, down) links of a vehicle, the same at every call."""
         if system_id not in self._pairs:
             up, down = self._links.of(system_id)
-            self._pairs[system_id] = self._made(up, system_id, LINK_UP), self._made(down, system_id, LINK_DOWN)
+            pair = self._made(up, system_id, LINK_UP), self._made(down, system_id, LINK_DOWN)
+            self._pairs[system_id] = pair
+            self._in_rows += pair
         return self._pairs[system_id]
+
+    def draw(self) -> None:
+        """Make the next block of draws of each link that has used up all but one."""
+        links = self.queues.links
+        for row in (links["made"] - links["drawn"] < BLOCK).nonzero()[0].tolist():
+            self._in_rows[row].draw()
 
     def hear(self, data: bytes, time_ns: int) -> None:
         """Look for the station's first set-point, which begins the flight and the links' time."""
         if is_set_point(data) and time_ns < self.zero_ns:
             self.zero_ns = time_ns
-            for link in (link for pair in self._pairs.values() for link in pair):
+            for link in self._in_rows:
                 link.zero_ns = time_ns
 
     def counters(self) -> Counter[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from scenarios.kernel import Columns, Record, Records, kernel
 from scenarios.sockets import Bytes
-from sim_vehicles.links.fate import BLOCK, DRAW, drawn_bad, flip, flips_of
+from sim_vehicles.links.fate import BLOCK, BLOCKS, DRAW, drawn_bad, flip, flips_of
 from sim_vehicles.links.truth import (
     CORRUPTED,
     DUPLICATE,
@@ -42,7 +42,7 @@ LINK = np.dtype(
         ("bad", "?"),  # whether the last datagram found it in its bad state
         ("barred", "i8"),  # why the datagram that enters next is dropped: OUTAGE, QUEUE_FULL, or PASSED if it is not
         ("last_due_ns", "i8"),
-        ("drawn", "i8"),  # how many of its draws are used
+        ("drawn", "i8"), ("made", "i8"),  # how many of its draws are used and made; NEVER_NS if it needs none
         # what happened to its datagrams, by the names of `truth.FATES`
         ("duplicated", "i8"), ("corrupted", "i8"), ("lost", "i8"), ("outage", "i8"), ("queue_full", "i8"),
         ("link_full", "i8"),
@@ -71,7 +71,7 @@ class Queues:
     frames: Bytes
     """The bytes of each entry, (k, FRAME_BYTES)."""
     draws: Records
-    """Of DRAW: the next draws of each link, (n, BLOCK)."""
+    """Of DRAW: the newest draws of each link, (n, BLOCKS * BLOCK); draw k is in column k modulo their number."""
     columns: Columns
     """Of `links`."""
     recorder: Recorder | None
@@ -91,9 +91,9 @@ class Queues:
 def new_queues(count: int, recorder: Recorder | None = None) -> Queues:
     """The queues of so many links that nothing has entered."""
     links, entries = np.zeros(count, LINK), np.zeros(_FIRST_SIZE, ENTRY)
-    links["next_due_ns"], links["drawn"] = NEVER_NS, BLOCK
+    links["next_due_ns"], links["made"] = NEVER_NS, NEVER_NS
     _free_from(entries, 1)
-    frames, draws = np.zeros((_FIRST_SIZE, FRAME_BYTES), np.uint8), np.zeros((count, BLOCK), DRAW)
+    frames, draws = np.zeros((_FIRST_SIZE, FRAME_BYTES), np.uint8), np.zeros((count, BLOCKS * BLOCK), DRAW)
     return Queues(links, entries, frames, draws, Columns(links), recorder, rows_of(recorder))
 
 
@@ -113,7 +113,7 @@ def has_room(entries: Records) -> bool:
 @kernel
 def ready(link: Record, entries: Records, truth: Records) -> bool:
     """Whether one more datagram, and a duplicate of it, can enter: there are draws, free entries and free records."""
-    return has_room(entries) and can_record(truth) and not (link.random and link.drawn == BLOCK)
+    return has_room(entries) and can_record(truth) and link.drawn < link.made
 
 
 @kernel
@@ -164,7 +164,7 @@ def enter_later(
             return _drop(link, entries, frames, truth, entry, dropped)
         _insert(link, entries, entry, end_ns + delay_ns)
         return PASSED
-    draw = draws[link.drawn]
+    draw = draws[link.drawn % len(draws)]
     link.drawn += 1
     link.bad = drawn_bad(link, draw)
     if dropped == PASSED and draw.loss < (link.loss_bad if link.bad else link.loss_good):

@@ -56,7 +56,8 @@ class Relay:
         self.last_heard_ns = start_ns
         """When the station was last heard; the start if never."""
         self._recorder = recorder
-        self._links = LinkSet(scenario, start_ns, recorder=recorder)
+        most = max(MOST_IN_NETWORK, len(scenario.vehicles))
+        self._links = LinkSet(scenario, start_ns, recorder=recorder, most=most)
         self._entering: list[Passing] = []
         """Datagrams received later than the last step's now: an earlier one may still be unread."""
         self._heap: list[tuple[int, int, int]] = []

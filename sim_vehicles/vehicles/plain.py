@@ -5,7 +5,7 @@ If its links are plain, too (`Link.plain`), the kernel runs its events in order 
 before one that is not usual.
 """
 
-from math import cos, pi, sin
+from math import copysign, cos, pi, sin, tau
 
 from scenarios.kernel import Record, Records, kernel
 from scenarios.sockets import Bytes, Ints
@@ -135,7 +135,8 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
             return MOVE_FIRST
         advance_to(vehicle, time_ns)
     north, east, yaw = vehicle.north_m, vehicle.east_m, vehicle.yaw_rad
-    if REPORTS[k] == GLOBAL_POSITION and not -pi < yaw < pi:
+    heading = _within_a_turn(yaw)
+    if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
         return UNUSUAL
     schedule_report(vehicle, k, vehicle.number[k] + 1)
     if REPORTS[k] == TIMESYNC:
@@ -151,7 +152,16 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
         return local_position(frame, vehicle, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
     latitude_deg, longitude_deg = degrees(north, east)
     altitude_m = ORIGIN_ALTITUDE_M + vehicle.altitude_m
-    return global_position(frame, vehicle, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, yaw)
+    return global_position(
+        frame, vehicle, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, heading
+    )  # fmt: skip
+
+
+@kernel
+def _within_a_turn(angle: float) -> float:
+    """The angle within half a turn to either side, to the bit that of `math.remainder`, which Numba does not know."""
+    over = abs(angle) % tau
+    return copysign(1.0, angle) * (over if over <= tau - over else over - tau)
 
 
 @kernel
