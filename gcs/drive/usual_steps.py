@@ -150,8 +150,9 @@ class UsualSteps:
         if how_far == NOT_LEFT:
             self._pass_on(count)
             stream, table = self._wire.sent[: state["sent_bytes"][0]], self._wire.to[:, : state["sent"][0]]
-            begun = (state[name][0] for name in ("entered", "waiting", "leaving"))
-            return Stopped(now_ns, self._fleet.go_on(Datagrams(stream, table.copy(), ids), *begun, now_ns), 0)
+            entered, waiting, leaving = (state[name][0] for name in ("entered", "waiting", "leaving"))
+            entering = Datagrams(stream, table.copy(), ids)
+            return Stopped(now_ns, self._fleet.go_on(entering, entered, waiting, leaving, now_ns), 0)
         arrived = Datagrams(*self._arrived(count - in_step, count), ids)
         self._pass_on(count - in_step)
         return Stopped(now_ns, arrived, state["taken"][0])
