@@ -28,7 +28,7 @@ NO_ADDRESS = -1
 NS_PER_S = 1_000_000_000
 _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _EAGAIN, _REFUSED = errno.EAGAIN, errno.ECONNREFUSED
-_DONTWAIT, _MONOTONIC, _IPV4 = 0x40, 1, 2
+_DONTWAIT, _REALTIME, _MONOTONIC, _IPV4 = 0x40, 0, 1, 2
 _NAME, _VECTOR, _CONTROL, _CLOCK, _WORDS = 7, 9, 11, 19, 21
 """Where the parts of the array begin, and its length."""
 _NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
@@ -102,7 +102,7 @@ class Reader:
 
     def read(self, descriptors: Sequence[int] | Ints) -> Batch:
         """What has arrived at these sockets; no others may have datagrams that were not read."""
-        begin_ns, to_monotonic_ns = time.monotonic_ns(), -realtime_offset_ns()
+        begin_ns, to_monotonic_ns = time.monotonic_ns(), -_offset_ns(self._buffers[2])
         count, end, errors, empty = _read(np.asarray(descriptors, np.int64), self._most, *self._buffers)
         read_ns = time.monotonic_ns()
         stream, table = self._buffers[0][:end].copy(), self._buffers[1][:, :count].copy()
@@ -138,11 +138,7 @@ def realtime_offset_ns() -> int:
 
     Taken from the quickest of three readings of both clocks, as the process may be interrupted between them.
     """
-    readings: list[tuple[int, int]] = []
-    for _ in range(3):
-        before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        readings.append((after_ns - before_ns, real_ns - (before_ns + after_ns) // 2))
-    return min(readings)[1]
+    return _offset_ns(_words())
 
 
 def number_of(address: tuple[str, int]) -> int:
@@ -165,6 +161,23 @@ def joined(datagrams: Sequence[bytes]) -> tuple[Bytes, Ints]:
 
 def _words() -> Ints:
     return np.zeros(_WORDS, np.int64)
+
+
+@kernel
+def _clock_ns(clock: int, words: Ints) -> int:
+    _clock_gettime(clock, words.ctypes.data + 8 * _CLOCK)
+    return words[_CLOCK] * NS_PER_S + words[_CLOCK + 1]
+
+
+@kernel
+def _offset_ns(words: Ints) -> int:
+    quickest_ns, offset_ns = NS_PER_S, 0
+    for _ in range(3):
+        before_ns, real_ns = _clock_ns(_MONOTONIC, words), _clock_ns(_REALTIME, words)
+        after_ns = _clock_ns(_MONOTONIC, words)
+        if after_ns - before_ns < quickest_ns:
+            quickest_ns, offset_ns = after_ns - before_ns, real_ns - (before_ns + after_ns) // 2
+    return offset_ns
 
 
 @kernel
@@ -220,8 +233,7 @@ def _write(
             words[_NAME], words[_NAME + 1] = addresses[k] << 16 | _IPV4, 0
             name, size = base + 8 * _NAME, _NAME_BYTES
         place = stream.ctypes.data + begins[k]
-        _clock_gettime(_MONOTONIC, base + 8 * _CLOCK)  # before: an answer may come before the call returns
-        sent_ns[k] = words[_CLOCK] * NS_PER_S + words[_CLOCK + 1]
+        sent_ns[k] = _clock_ns(_MONOTONIC, words)  # before: an answer may come before the call returns
         if _sendto(descriptors[k], place, ends[k] - begins[k], _DONTWAIT, name, size) < 0:
             if _errno()[0] == _REFUSED:
                 refused += 1
