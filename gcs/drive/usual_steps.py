@@ -5,7 +5,7 @@ changes, a step in Python goes on from there (`gcs.drive.lockstep`).
 """
 
 from collections.abc import Generator, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from sim_vehicles.links.queue import copy_bytes
 from sim_vehicles.links.truth import can_record
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.vehicles.plain import step_all
+
+if TYPE_CHECKING:
+    from scenarios.handle import Handle
 
 NOT_LEFT, PAUSED = -1, -2
 """How far steps came, beside what `usual_step` returns: not all that leaves the vehicles' links has left; all is done,
@@ -101,6 +104,7 @@ class UsualSteps:
         self._state, self._due, self._most_ticks = Columns(self._wire.state), Columns(self._wire.due), ticks
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
         self._tick_bytes = n * TICK.itemsize
+        self._handle: "Handle | None" = None
 
     def fly(self, entering: Datagrams) -> Generator[TickArray, None, Stopped]:
         """Do steps until one is not usual, which is returned; yields the rows of the control ticks.
@@ -115,11 +119,15 @@ class UsualSteps:
             return Stopped(now_ns, self._fleet.step(entering, now_ns), 0)
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
-        ends = handle(Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire))
+        ends = Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire)
+        if self._handle is None or not _same(ends, self._handle.kept):
+            self._handle = handle(ends)
         arrived, ticks, most = state["arrived"], state["ticks"], _FIRST_TICKS
         while True:
             self._fleet.make_ready()
-            how_far = _fly(ends, station.look_ahead(self._due, min(most, self._most_ticks)), self._room, self._ahead)
+            how_far = _fly(
+                self._handle, station.look_ahead(self._due, min(most, self._most_ticks)), self._room, self._ahead
+            )
             most *= 2
             if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
@@ -156,6 +164,11 @@ class UsualSteps:
         arrived = Datagrams(*self._arrived(count - in_step, count), ids)
         self._pass_on(count - in_step)
         return Stopped(now_ns, arrived, state["taken"][0])
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether tuples of arrays, or of such tuples, hold the same ones."""
+    return one is other or (isinstance(one, tuple) and all(map(_same, one, other)))
 
 
 @array_kernel
