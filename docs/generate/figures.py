@@ -437,3 +437,23 @@ def speed(runner: Runner) -> str:
         "station, of its period of 20 ms",
     )  # fmt: skip
     return table(head, rows)
+
+
+def map_speed(runner: Runner) -> str:
+    """How fast one process flies and judges the trials of maps."""
+    rows: list[tuple[str, ...]] = []
+    for vehicles, options in (
+        (5, "triangle5.toml --delay 0.02:0.3:15 --seeds 4"),
+        (20, "chain20.toml --delay 0.02:0.28:8 --seeds 2"),
+        (5, "triangle5.toml --delay 0.05:0.25:5 --jitter 0.01,0.03 --seeds 4"),
+    ):
+        out = f"runs/map{len(rows) + 1}"
+        runner.run(f"gcs stress scenarios/{options} --workers 1 --out {out}")
+        trials = [json.loads(line) for line in (runner.folder / out / "trials.jsonl").read_text("utf-8").splitlines()]
+        figures = [f"`{options.partition(' ')[2].rpartition(' --seeds')[0]}`", f"{vehicles}", f"{len(trials)}"]
+        for kinds in (("probe",), ("own",), ("probe", "own")):
+            own = [trial for trial in trials if trial["kind"] in kinds]
+            flown_s = vehicles * sum(len(trial["trace_m"]) * trial["trace_period_s"] for trial in own)
+            figures.append(f"{flown_s / sum(trial['elapsed_s'] for trial in own):.0f}")
+        rows.append(tuple(figures))
+    return table(("map", "vehicles", "trials", "probes", "own trials", "both"), rows)

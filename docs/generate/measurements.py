@@ -39,8 +39,8 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "slow": (figures.onsets, figures.maps, figures.capacity, figures.copters_onset),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
-        *(figures.signing, figures.design_time, figures.speed, figures.onset_real_time, tick_ratio, peers, cluster),
-        *(stages, certificates),
+        *(figures.signing, figures.design_time, figures.speed, figures.map_speed, figures.onset_real_time),
+        *(tick_ratio, peers, cluster, stages, certificates),
     ),
 }
 

@@ -142,6 +142,7 @@ def prepare(plan: FlightPlan) -> None:
     for _ in range(_STEPS_TO_PREPARE):
         outbox, _ = station.step([], station.next_event_ns)
         station.sent(outbox, np.zeros(len(outbox), np.int64))
+    station.vehicles[0].frames.restart()  # as after a long silence
 
 
 def fly_lockstep(

@@ -104,7 +104,7 @@ class UsualSteps:
         self._state, self._due, self._most_ticks = Columns(self._wire.state), Columns(self._wire.due), ticks
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
         self._tick_bytes = n * TICK.itemsize
-        self._handle: "Handle | None" = None
+        self._handle: Handle | None = None
 
     def fly(self, entering: Datagrams) -> Generator[TickArray, None, Stopped]:
         """Do steps until one is not usual, which is returned; yields the rows of the control ticks.

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gcs.control.tick import TickArray
 from gcs.errors import InputError, usable
 from gcs.published import Published
@@ -25,7 +25,7 @@ from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED
 Truth = NDArray[np.void]
 """Records as sim_vehicles.links.truth.DTYPE lays them out."""
 
-_TIMESYNC = 111
+_TIMESYNC, _NEVER = 111, -1
 
 
 class Graded(Published):
@@ -171,11 +171,22 @@ def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
 
 def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
     """(k, 2) instants in ns at which a vehicle's commands acted and at which the states used were sampled, in order."""
-    sampled, acted = (instants(truth[truth["system_id"] == system_id], kind) for kind in (SAMPLED, ACTED))
-    rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"]]
-    known = [((system_id, key), (system_id, boot)) for key, boot in rows[["key_ms", "sample_boot_ms"]].tolist()]
-    pairs = [(acted[key], sampled[boot]) for key, boot in known if key in acted and boot in sampled]
-    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+    own, of_truth = (ticks["system_id"] == system_id) & ticks["commanded"], truth["system_id"] == system_id
+    acted_ns, sampled_ns = (
+        _first_ns(truth, of_truth & (truth["kind"] == kind), ticks[name][own])
+        for kind, name in ((ACTED, "key_ms"), (SAMPLED, "sample_boot_ms"))
+    )
+    known = (acted_ns != _NEVER) & (sampled_ns != _NEVER)
+    pairs = np.stack([acted_ns, sampled_ns], axis=1)[known]
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+
+def _first_ns(truth: Truth, which: NDArray[np.bool_], keys: IntArray) -> IntArray:
+    """The instant (ns) of the first of some records with each of these keys; _NEVER where there is none."""
+    known, first = np.unique(truth["key"][which], return_index=True)
+    found_ns = np.append(truth["time_ns"][which][first], _NEVER)
+    place = np.searchsorted(known, keys)
+    return found_ns[np.where(np.append(known, -1)[place] == keys, place, -1)]
 
 
 def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
