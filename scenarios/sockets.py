@@ -32,7 +32,7 @@ _DONTWAIT, _REALTIME, _MONOTONIC, _IPV4 = 0x40, 0, 1, 2
 _NAME, _VECTOR, _CONTROL, _CLOCK, _WORDS = 7, 9, 11, 19, 21
 """Where the parts of the array begin, and its length."""
 _NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
-_48_BITS = 0xFFFFFFFFFFFF
+_48_BITS, _LONGEST_NS = 0xFFFFFFFFFFFF, 2**63 - 1
 
 
 class _External:
@@ -134,10 +134,7 @@ class Sent(NamedTuple):
 
 
 def realtime_offset_ns() -> int:
-    """The offset from the monotonic clock to ns since 1970.
-
-    Taken from the quickest of three readings of both clocks, as the process may be interrupted between them.
-    """
+    """The offset from the monotonic clock to ns since 1970."""
     return _offset_ns(_words())
 
 
@@ -171,7 +168,8 @@ def _clock_ns(clock: int, words: Ints) -> int:
 
 @kernel
 def _offset_ns(words: Ints) -> int:
-    quickest_ns, offset_ns = NS_PER_S, 0
+    """That of the quickest of three readings of both clocks, as the process may be interrupted between them."""
+    quickest_ns, offset_ns = _LONGEST_NS, 0
     for _ in range(3):
         before_ns, real_ns = _clock_ns(_MONOTONIC, words), _clock_ns(_REALTIME, words)
         after_ns = _clock_ns(_MONOTONIC, words)

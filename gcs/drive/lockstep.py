@@ -200,12 +200,12 @@ def _ticks(
     bridge = _Bridge(plan.formation.system_ids)
     to_vehicles: Sent = bridge.to_vehicles(Outbox(), START_NS)
     plain = guard is None and station.is_usual
-    fleet = vehicles if plain and isinstance(vehicles, Fleet) else None
+    fleet = vehicles if plain and isinstance(vehicles, Fleet) and vehicles.is_usual else None
     usual = None if fleet is None else UsualSteps(station, fleet, bridge.addresses, bridge.rows, ahead=ahead)
     while station.phase is not Phase.ENDED:
-        # only the first set-point, which begins the flight, is not usual for the vehicles
-        begun = fleet is not None and fleet.is_usual and (fleet.begun or station.phase is Phase.CONNECTING)
-        if usual is not None and begun and isinstance(to_vehicles, Datagrams):
+        # vehicles look for the set-point at which the time of their links begins; there is none while CONNECTING
+        usual_now = fleet is not None and (fleet.knows_link_time or station.phase is Phase.CONNECTING)
+        if usual is not None and usual_now and isinstance(to_vehicles, Datagrams):
             now_ns, arrived, taken = yield from usual.fly(to_vehicles)
         else:
             now_ns, taken = station.next_event_ns, 0

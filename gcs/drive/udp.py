@@ -35,11 +35,14 @@ _MOST_ADDRESSES = 8192
 """Most addresses that are remembered: anybody may send."""
 _NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
 """Where the network is in an address's key, and the bits of `number_of`."""
-_TOGETHER_NS, _SOONER_NS = 10_000_000, 3_000_000
-"""The station wakes for datagrams at most once in the first time, as their stamps say when they arrived, and it decides
-only at ticks. It wakes once in the second time after what it did took longer than `_LONG_NS`."""
-_BEFORE_TICK_NS, _LONG_NS = 2_000_000, 500_000
-"""The first time before a tick, what has arrived is read. 250 vehicles send 30 datagrams in the time that is left."""
+_TOGETHER_NS = 8_000_000
+"""The station wakes for datagrams no sooner than this after it last woke: their stamps say when they arrived, and it
+decides only at ticks. What has to be quicker is answers: PX4 ignores those that come more than 10 ms after it asked for
+the time."""
+_LONG_NS, _SOONER_NS = 500_000, 3_000_000
+"""If what it did when it last woke took longer than the first time, it wakes after the second."""
+_BEFORE_TICK_NS = 2_000_000
+"""What has arrived is read so long before a tick. 250 vehicles send 30 datagrams in the time that is left."""
 _PR_SET_TIMERSLACK = 29
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 

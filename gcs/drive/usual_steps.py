@@ -31,8 +31,8 @@ but Python has to take what there is of rows and datagrams."""
 _STEPS = 4
 """Steps whose datagrams there is room for."""
 _FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 32, 1024
-"""Ticks that are flown at a time, if nobody needs to see them one by one: at first, as there may soon be something for
-Python to do, and later."""
+"""Ticks that are flown in one call if nobody needs to see them one by one: at first, as there may soon be something for
+Python to do, and at most later; and the most rows of these."""
 _WIRE = np.dtype(
     [
         ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams that have not been passed on
@@ -122,13 +122,11 @@ class UsualSteps:
         ends = Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire)
         if self._handle is None or not _same(ends, self._handle.kept):
             self._handle = handle(ends)
-        arrived, ticks, most = state["arrived"], state["ticks"], _FIRST_TICKS
+        arrived, ticks, most = state["arrived"], state["ticks"], min(_FIRST_TICKS, self._most_ticks)
         while True:
             self._fleet.make_ready()
-            how_far = _fly(
-                self._handle, station.look_ahead(self._due, min(most, self._most_ticks)), self._room, self._ahead
-            )
-            most *= 2
+            how_far = _fly(self._handle, station.look_ahead(self._due, most), self._room, self._ahead)
+            most = min(2 * most, self._most_ticks)
             if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
             if ticks[0]:

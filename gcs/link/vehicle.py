@@ -294,9 +294,9 @@ class RemoteVehicle:
 
     @property
     def quiet_until_ns(self) -> float:
-        """Until when `next_frame` changes nothing, if its parameters are uploaded and it says nothing unusual.
+        """Until when `next_frame` sends nothing and the vehicle cannot become `silent`.
 
-        Nor is it `silent` before. 0 if that is not known, infinity if it is so for good.
+        This holds if its parameters are uploaded and it says nothing unusual. 0 if unknown, infinity until it is heard.
         """
         waiting = self._command
         if self.address is None:
@@ -307,7 +307,7 @@ class RemoteVehicle:
 
     @property
     def has_to_speak(self) -> bool:
-        """Whether it is not ready before it says something unusual."""
+        """Whether it cannot become ready before it says something unusual."""
         return not self.left_out and (self.address is None or self._next_step().command is not None)
 
     @property

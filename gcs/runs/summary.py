@@ -98,8 +98,11 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """The verdict on a flight and what it rests on. `flown` are the rows of the flight, `errors` by system id."""
+class Judgement:
+    """The verdict on a flight and what it rests on.
+
+    `flown` holds the rows of the flight; `flown_of` these rows, and `errors` the spacing errors, by system id.
+    """
 
     verdict: str
     reason: str
@@ -116,7 +119,7 @@ class Judged:
         return [(float(error_m.max()), float(error_m[-1])) for _, error_m in self.errors.values() if error_m.size]
 
 
-def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judged:
+def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judgement:
     """Judge a flight by its ticks and events; see `verdict`."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = chosen(ticks, (ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1)))
@@ -135,7 +138,7 @@ def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judg
     headroom_end = min(_medians(late, "headroom").values(), default=None)
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     found = verdict(reason, settled, headroom_end=headroom_end, logged=logged)
-    return Judged(found, reason, settled, headroom_end, not_logged, flown, flown_of, errors)
+    return Judgement(found, reason, settled, headroom_end, not_logged, flown, flown_of, errors)
 
 
 def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:

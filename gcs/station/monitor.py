@@ -249,7 +249,7 @@ class FormationMonitor:
         )  # fmt: skip
 
     def is_calm(self, time_s: float, *, flying: bool) -> bool:
-        """Whether all vehicles fly, or none is to, with the gains and the spacing that they keep."""
+        """Whether gains and spacing stay as they are and, in flight, no vehicle is away."""
         if time_s < self._settled_s or self.opening != 1.0:
             return False
         return not flying or not ((self._keys.act and self._troubled) or self.away)

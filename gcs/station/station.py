@@ -185,48 +185,57 @@ class Station:
             return 0
         if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
             return 0
-        quiet_until_ns, patience_s = inf if flying else self._quiet_until_ns(), self._patience_s
+        quiet_until_ns, longest_s = inf if flying else self._quiet_until_ns(), self._longest_phase_s
         flies, times_s, north_m_s, east_m_s = (ticks[name] for name in DUE.names or ())
         for place in range(most):
             due_ns = next_ns + place * self._period_ns
-            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= patience_s:
+            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= longest_s:
                 return place
             flies[place], times_s[place] = flying, self.scenario_time_s(due_ns)
             north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(times_s[place])
         return most
 
     def _quiet_until_ns(self) -> float:
-        """Until when nothing is done at ticks before and after the flight, unless a vehicle says something unusual.
+        """Before and after the flight: until when ticks do nothing, unless a vehicle says something unusual.
 
-        0 if that is not known. See also `_patience_s`.
+        0 if that is not known; see also `_longest_phase_s`.
         """
-        ends = self.phase is Phase.ENDING
-        waits = ends or (self.phase is Phase.CONNECTING and not self._journal.stop)
-        if not waits or len(self.vehicles) > _IN_A_TICK:
+        if len(self.vehicles) > _IN_A_TICK:
             return 0
-        if not ends and not any(vehicle.has_to_speak for vehicle in self.vehicles):
-            return 0
-        return min(vehicle.quiet_until_ns for vehicle in self.vehicles)
+        if self.phase is Phase.ENDING:
+            waits = not self._all_ended
+        else:
+            waits = self.phase is Phase.CONNECTING and not self._journal.stop
+            waits = waits and any(vehicle.has_to_speak for vehicle in self.vehicles)
+        return 0 if not waits else min(vehicle.quiet_until_ns for vehicle in self.vehicles)
 
     def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
-        """A tick, flying, whose set-points kernels have made; the arguments are as in `Tick`."""
+        """A tick in flight whose set-points kernels have made; the arguments are as in `Tick`."""
         self._journal.now_ns = self._columns["now_ns"][0]
-        controls, rtt_s = self._scratch.controls.copy(), self._scratch.rtt_s
-        followed = commanded(controls, self._monitor.released, True)
-        judged = self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
         number = (due_ns - self._start_ns) // self._period_ns
-        return Tick(number, time_s, due_ns, self._key_ms(due_ns), judged, indices)
+        return Tick(number, time_s, due_ns, self._key_ms(due_ns), None, indices)
+
+    def _judged_by_kernels(self, due_ns: int) -> Judged:
+        """What the kernels found that made the set-points of a tick."""
+        controls, rtt_s = self._scratch.controls, self._scratch.rtt_s
+        followed = commanded(controls, self._monitor.released, True)
+        return self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
 
     def _key_ms(self, due_ns: int) -> int:
         """The `time_boot_ms` of the set-points of a tick."""
         return (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
 
     @property
-    def _patience_s(self) -> float:
-        """How long the phase lasts at most."""
+    def _longest_phase_s(self) -> float:
+        """How long CONNECTING, FLYING or ENDING lasts at most."""
         if self.phase is Phase.FLYING:
             return self.plan.scenario.duration_s
         return END_PATIENCE_S if self.phase is Phase.ENDING else self._start_patience_s
+
+    @property
+    def _all_ended(self) -> bool:
+        """Whether all vehicles that were ever heard hold or land, or are not the station's to end."""
+        return all(vehicle.ended for vehicle in self.vehicles if vehicle.address is not None)
 
     def _waited_s(self, due_ns: int) -> float:
         """How long the phase will have lasted at a tick."""
@@ -250,7 +259,7 @@ class Station:
         `sent_ns` says when each datagram of the step was sent. What set-points need not wait for is judged here:
         whether the formation is broken, and who is back near its place.
         """
-        judged = tick.judged
+        judged = tick.judged or self._judged_by_kernels(tick.due_ns)
         near = nearest(judged.controls, tick.due_ns, judged.reported["down_m"] if self._has_slots else None)
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
@@ -259,7 +268,7 @@ class Station:
             self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
         at_ns = np.asarray(sent_ns, np.int64) if len(sent_ns) else np.array([self._journal.now_ns])
         own_ns = at_ns[tick.set_point_indices]  # -1 finds the last one, for vehicles that were sent none
-        rows, self._used_s[:] = tick_rows(tick, self._fleet.links, near.distance_m, own_ns)
+        rows, self._used_s[:] = tick_rows(tick, judged, self._fleet.links, near.distance_m, own_ns)
         return rows
 
     # -- the control tick ------------------------------------------------------------------------------------------
@@ -412,7 +421,7 @@ class Station:
             if self.plan is not self._fleet.plan:
                 self.plan = self._fleet.plan
                 self._tolerated = self._tolerated and self._tolerances(np.zeros(len(self.vehicles)))
-        if self.phase is Phase.FLYING and (waited_s >= self._patience_s or all(self._absent)):
+        if self.phase is Phase.FLYING and (waited_s >= self._longest_phase_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
         if self.phase is Phase.FLYING and not self._journal.stop:
             return
@@ -423,7 +432,7 @@ class Station:
             self.phase,
             all_ready=all_ready,
             stop=bool(self._journal.stop),
-            all_holding=all(v.ended for v in self.vehicles if v.address is not None),
+            all_holding=self._all_ended,
             waited_s=waited_s,
             identified=self._fleet.identified,
         )

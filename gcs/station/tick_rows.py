@@ -44,13 +44,14 @@ class Tick(NamedTuple):
     time_s: float
     due_ns: int
     key_ms: int
-    judged: Judged
+    judged: Judged | None
+    """None until its set-points are sent, if kernels have made them."""
     set_point_indices: IntArray
     """For each vehicle the index of its set-point among the datagrams of the step; -1 if it was sent none."""
 
 
 def tick_rows(
-    tick: Tick, links: Links, nearest_m: FloatArray, sent_ns: NDArray[np.int64]
+    tick: Tick, judged: Judged, links: Links, nearest_m: FloatArray, sent_ns: NDArray[np.int64]
 ) -> tuple[TickArray, FloatArray]:
     """The rows of a tick, and how much of its margin each vehicle uses.
 
@@ -59,7 +60,7 @@ def tick_rows(
     prediction.
     """
     rows, used = np.empty(len(sent_ns), TICK), np.empty(len(sent_ns))
-    fill(rows, used, links.known, links.clocks.known, links.counters, tick.judged, nearest_m, sent_ns, *tick[:4])
+    fill(rows, used, links.known, links.clocks.known, links.counters, judged, nearest_m, sent_ns, *tick[:4])
     return rows, used
 
 

@@ -1,9 +1,9 @@
 """A station's usual step, and its usual tick, in one kernel each: nothing happens that Python has to see to.
 
 Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation whose
-loop the station closes without prediction: in flight with every vehicle heard, guided and at ease, before and after it
-while the station waits for answers. They are made of the same kernels as the steps in Python, which take over wherever
-these stop.
+loop the station closes without prediction: in flight, if every vehicle is heard, guided and at ease; before and after
+the flight, while the station only waits for answers. They are made of the same kernels as the steps in Python, which
+take over wherever these stop.
 """
 
 from math import inf, isfinite, isnan
@@ -220,7 +220,7 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 @kernel
 def _is_calm(usual: Usual, due: Due) -> bool:
-    """Whether the monitor has nothing to do but to note delays and times, which is done only then."""
+    """Whether the monitor has nothing to do but to note delays and times; they are noted only then."""
     limits, n, judged = usual.limits[0], len(usual.used_s), usual.watched.judged[0]
     silent = usual.silent
     for row in range(n):

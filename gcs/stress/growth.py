@@ -244,8 +244,8 @@ def _modes(values: FloatArray, most: int) -> ComplexArray | None:
     rows = min(count // 2, _LONGEST_HANKEL)
     windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
     # the left singular vectors of H = L Q are those of L, which is small
-    transposed: Any = np.linalg.qr(windows.reshape(rows, -1).T, mode="r")
-    left, singular, _ = np.linalg.svd(transposed.T)
+    L_transposed: Any = np.linalg.qr(windows.reshape(rows, -1).T, mode="r")
+    left, singular, _ = np.linalg.svd(L_transposed.T)
     order = min(most, int(np.count_nonzero(singular > _RANK_FLOOR * singular[0])), rows - 1)
     if order == 0:
         return None

@@ -287,7 +287,7 @@ class _Rebuilding:
         )  # fmt: skip
         number = round((due_ns - self._start_ns) / self._period_ns)
         tick = Tick(number, time_s, due_ns, key_ms, judged, np.empty(0, np.int64))
-        rows, _ = tick_rows(tick, self._fleet.links, near.distance_m, np.array([own_ns for own_ns, _ in sent]))
+        rows, _ = tick_rows(tick, judged, self._fleet.links, near.distance_m, np.array([own_ns for own_ns, _ in sent]))
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:

@@ -219,11 +219,11 @@ class Fleet:
 
     @property
     def is_usual(self) -> bool:
-        """Whether `step` does nothing before `step_all`, but for noticing that the flight has begun."""
+        """Whether `step` does nothing before `step_all`, but for noticing when the time of the links begins."""
         return self._external is None and not self._in_order
 
     @property
-    def begun(self) -> bool:
+    def knows_link_time(self) -> bool:
         """Whether it is known when the time of the links began: by default at the station's first set-point."""
         return self._links.zero_ns != NEVER_NS
 

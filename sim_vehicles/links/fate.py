@@ -21,7 +21,7 @@ from scenarios.schema import NS_PER_S
 MOST_FLIPS = 4
 BLOCK, BLOCKS = 128, 2
 """Datagrams whose draws are made together, as numpy takes as long for one as for a hundred, and how many such blocks
-there are at a time: the next one is made before the last one is used up."""
+there are at a time: a new one is made while a part of the other is left."""
 
 
 DRAW = np.dtype(

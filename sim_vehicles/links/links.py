@@ -26,7 +26,6 @@ from sim_vehicles.services.mavlink import message_id
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
-"""The largest system id of a vehicle."""
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
 
@@ -191,7 +190,7 @@ class Link:
         return self.kind, self.system_id, message_id(data), time_ns, entered_ns, due_ns, fate, queued_ns
 
     def draw(self) -> None:
-        """Make the next block of draws unless there is one."""
+        """Make the next block of draws, unless a whole block is left."""
         if self._stream is not None and self._made - self._drawn < BLOCK:
             draws = self._queues.draws[self._row]
             place = self._made % len(draws)
@@ -255,13 +254,13 @@ class LinkSet:
         """The (up, down) links of a vehicle, the same at every call."""
         if system_id not in self._pairs:
             up, down = self._links.of(system_id)
-            pair = self._made(up, system_id, LINK_UP), self._made(down, system_id, LINK_DOWN)
+            pair = self._new(up, system_id, LINK_UP), self._new(down, system_id, LINK_DOWN)
             self._pairs[system_id] = pair
             self._in_rows += pair
         return self._pairs[system_id]
 
     def draw(self) -> None:
-        """Make the next block of draws of each link that has used up all but one."""
+        """Make the next block of draws of each link that has less than a block left."""
         links = self.queues.links
         for row in (links["made"] - links["drawn"] < BLOCK).nonzero()[0].tolist():
             self._in_rows[row].draw()
@@ -283,7 +282,7 @@ class LinkSet:
             total["link_down_dropped"] += down.dropped
         return total
 
-    def _made(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
+    def _new(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
             queues=self.queues, row=row_of(len(self._pairs), kind),

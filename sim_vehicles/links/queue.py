@@ -42,7 +42,7 @@ LINK = np.dtype(
         ("bad", "?"),  # whether the last datagram found it in its bad state
         ("barred", "i8"),  # why the datagram that enters next is dropped: OUTAGE, QUEUE_FULL, or PASSED if it is not
         ("last_due_ns", "i8"),
-        ("drawn", "i8"), ("made", "i8"),  # how many of its draws are used and made; NEVER_NS if it needs none
+        ("drawn", "i8"), ("made", "i8"),  # how many draws it has used, and how many are made: NEVER_NS if it needs none
         # what happened to its datagrams, by the names of `truth.FATES`
         ("duplicated", "i8"), ("corrupted", "i8"), ("lost", "i8"), ("outage", "i8"), ("queue_full", "i8"),
         ("link_full", "i8"),

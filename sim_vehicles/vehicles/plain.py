@@ -135,7 +135,7 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
             return MOVE_FIRST
         advance_to(vehicle, time_ns)
     north, east, yaw = vehicle.north_m, vehicle.east_m, vehicle.yaw_rad
-    heading = _within_a_turn(yaw)
+    heading = _within_half_a_turn(yaw)
     if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
         return UNUSUAL
     schedule_report(vehicle, k, vehicle.number[k] + 1)
@@ -158,8 +158,8 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
 
 
 @kernel
-def _within_a_turn(angle: float) -> float:
-    """The angle within half a turn to either side, to the bit that of `math.remainder`, which Numba does not know."""
+def _within_half_a_turn(angle: float) -> float:
+    """`math.remainder(angle, tau)`, which Numba does not know, to the bit but for the sign of exactly half a turn."""
     over = abs(angle) % tau
     return copysign(1.0, angle) * (over if over <= tau - over else over - tau)
 

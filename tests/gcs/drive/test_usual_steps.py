@@ -72,6 +72,17 @@ def changed(name: str, delay_s: float | None = None, link: dict[str, Any] | None
     return scenario.model_copy(update={"duration_s": 6.0, **changes})
 
 
+def never_heard() -> Scenario:
+    scenario = changed("chain3", link={"loss_probability": 1.0})
+    return scenario.model_copy(update={"links": scenario.links.model_copy(update={"times_from": "start"})})
+
+
+def ends_in_failsafe() -> Scenario:
+    """A vehicle that holds already when the flight ends, and stays in the mode in which the monitor saw it."""
+    alone = changed("chain3", vehicles=load(SCENARIOS / "chain3.toml").vehicles[:1], seed=14, duration_s=3.0)
+    return alone.with_links(lambda up: up, lambda down: down.model_copy(update={"loss_probability": 0.93}))
+
+
 FLIGHTS = {
     "calm": changed("triangle5"),
     "coupled": changed("chain3_bidirectional"),
@@ -83,6 +94,8 @@ FLIGHTS = {
     "silence": changed("chain3", link=SILENT),
     "breaks": changed("triangle5", 0.6).with_calm_monitor(),
     "start-up over slow links": changed("triangle5", 0.8, link=WILD, duration_s=2.0),
+    "never heard": never_heard(),
+    "ends in failsafe": ends_in_failsafe(),
     "turns round": changed("chain3", 0.9, limits=Limits(speed_min_m_s=0.001), duration_s=20.0).with_calm_monitor(),
 }
 

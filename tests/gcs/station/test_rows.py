@@ -38,7 +38,7 @@ def test_every_column_holds_what_its_name_says() -> None:
         shorter_s=np.array([(inf, 0.2)] * 2), longer_s=np.array([(0.2, 0.3)] * 2), repeated_s=np.array([0.0, 0.01]),
     )  # fmt: skip
     tick = Tick(11, 0.22, 10 * S + 40_000_000, 220, judged, set_point_indices=np.array([0, 1]))
-    rows, used_s = tick_rows(tick, links, np.array([nan, 121.5]), np.array([0, 10 * S + 50_000_000]))
+    rows, used_s = tick_rows(tick, judged, links, np.array([nan, 121.5]), np.array([0, 10 * S + 50_000_000]))
     expected = {
         "tick": 11, "time_s": 0.22, "due_ns": 10 * S + 40_000_000, "sent_ns": 10 * S + 50_000_000, "key_ms": 220,
         "system_id": 7, "mode": 2, "gain_set": 1, "commanded": True,
@@ -72,7 +72,7 @@ def test_what_is_not_known_is_not_a_number() -> None:
         longer_s=np.full((2, 1), 0.4), repeated_s=np.zeros(2),
     )  # fmt: skip
     tick = Tick(0, -1.0, S, 0, judged, set_point_indices=np.array([-1, -1]))
-    rows, used_s = tick_rows(tick, links, np.full(2, nan), np.full(2, S))
+    rows, used_s = tick_rows(tick, judged, links, np.full(2, nan), np.full(2, S))
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][1])}
     floats = {name for name in TICK.names or () if TICK[name].kind == "f"}
     assert unknown == floats - {"time_s", "repeated_s", "assumed_delay_s", "delay_margin_s"}
