@@ -151,8 +151,8 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
-    slowest_s = max(delays_s.values(), default=None)
-    longest_flown = int(np.bincount(sent["gain_set"], minlength=1).argmax())
+    slowest = max(delays_s, key=delays_s.__getitem__, default=0)  # its gains, as its delay, count for alpha
+    longest_flown = int(np.bincount(sent["gain_set"][sent["system_id"] == slowest], minlength=1).argmax())
     return Summary(
         scenario=scenario.name,
         verdict=judged.verdict,
@@ -166,7 +166,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         response=design.response,
         loop_delay_s=_spread(sent["loop_delay_s"]),
         loop_delay_bound_s=np.fmax.reduce(sent["loop_delay_bound_s"], initial=np.nan),
-        at_loop_delay=figures_at(design, scenario, slowest_s, longest_flown),
+        at_loop_delay=figures_at(design, scenario, delays_s.get(slowest), longest_flown),
         spread=_flown_spread(scenario, design, flown, delays_s),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
         headroom_end=judged.headroom_end,

@@ -13,6 +13,7 @@ from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design, FiguresAtDelay
 from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.planner import flight_plan
+from gcs.runs.files import by_vehicle
 from gcs.runs.summary import summarise
 from gcs.views.report import print_design
 from gcs.views.table import FlightState, plain_line
@@ -83,6 +84,21 @@ def test_table_and_summary_tell_both_at_the_measured_loop_delay() -> None:
     state.add(rows[(rows["time_s"][:, 0] > 3.0) & (rows["time_s"][:, 0] < 5.9)], [])
     assert f"alpha {told.alpha:.2f}" in plain_line(state)
     assert f"errors grow {told.string_peak:.1f}" in plain_line(state)
+
+
+def test_alpha_is_that_of_the_slowest_vehicles_own_gains() -> None:
+    links = Links(vehicles=(VehicleLinks(system_id=4, down=Link(delay_s=0.45)),))
+    safety = TRIANGLE.safety.model_copy(update={"spacing_error_limit_m": 300.0})
+    slow = TRIANGLE.model_copy(update={"links": links, "safety": safety, "duration_s": 20.0})
+    design, plan = flight_plan(slow)
+    flight = fly_plan(plan)
+    sets = {key: own["gain_set"][own["commanded"]] for key, own in by_vehicle(flight.ticks).items()}
+    longest = {key: int(np.bincount(own).argmax()) for key, own in sets.items()}
+    assert longest[4] > 0  # its own delay has made it change to slower gains, and nobody else
+    assert {longest[key] for key in (1, 2, 3, 5)} == {0}
+    told = summarise(slow, design, flight.ticks, flight.events).at_loop_delay
+    assert told == figures_at(design, slow, told.loop_delay_s, longest[4])
+    assert known(told.alpha) > 0.1
 
 
 def test_general_pattern_gains_have_formation_alpha_and_no_string_verdict() -> None:
