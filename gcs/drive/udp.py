@@ -37,12 +37,12 @@ _NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
 """Where the network is in an address's key, and the bits of `number_of`."""
 _TOGETHER_NS = 8_000_000
 """The station wakes for datagrams no sooner than this after it last woke: their stamps say when they arrived, and it
-decides only at ticks. What has to be quicker is answers: PX4 ignores those that come more than 10 ms after it asked for
-the time."""
+decides only at ticks. Answers cannot wait longer: PX4 ignores one that comes more than 10 ms after it asked for the
+time."""
 _LONG_NS, _SOONER_NS = 500_000, 3_000_000
 """If what it did when it last woke took longer than the first time, it wakes after the second."""
 _BEFORE_TICK_NS = 2_000_000
-"""What has arrived is read so long before a tick. 250 vehicles send 30 datagrams in the time that is left."""
+"""What has arrived is read this long before a tick. 250 vehicles send 30 datagrams in the time that is left."""
 _PR_SET_TIMERSLACK = 29
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 

@@ -205,9 +205,9 @@ class Station:
         if self.phase is Phase.ENDING:
             waits = not self._all_ended
         else:
-            waits = self.phase is Phase.CONNECTING and not self._journal.stop
-            waits = waits and any(vehicle.has_to_speak for vehicle in self.vehicles)
-        return 0 if not waits else min(vehicle.quiet_until_ns for vehicle in self.vehicles)
+            connects = self.phase is Phase.CONNECTING and not self._journal.stop
+            waits = connects and any(vehicle.has_to_speak for vehicle in self.vehicles)
+        return min(vehicle.quiet_until_ns for vehicle in self.vehicles) if waits else 0
 
     def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
         """A tick in flight whose set-points kernels have made; the arguments are as in `Tick`."""

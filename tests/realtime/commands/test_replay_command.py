@@ -100,9 +100,7 @@ def test_pymavlinks_own_log_shows_its_links_and_errors(tmp_path: Path) -> None:
         assert links["telemetry_hz"] == pytest.approx(4.0, abs=0.6)
         assert links["loop_delay_s"]["status"] == "lower bound"
         assert links["lost"] == 0
-        age_s = links["telemetry_age_s"]
-        assert 0.05 < age_s["p50"] < 0.25  # at 4 Hz; a busy machine holds single reports back
-        assert age_s["max"] > 0.15
+        assert 0.15 < links["telemetry_age_s"]["max"] < 0.35  # at 4 Hz
     assert all(vehicle["spacing_error_max_m"] > 1 for vehicle in result["flight"]["vehicles"][1:])
 
 
