@@ -213,6 +213,22 @@ def onsets(runner: Runner) -> str:
     return table(("scenario", "sampled margin", "onset in flight", "difference", "curve"), rows)
 
 
+_ONE_LINK = (("triangle5", 5), ("chain3_bidirectional", 1), ("chain3_bidirectional", 2), ("chain3_bidirectional", 3))
+
+
+def one_link(runner: Runner) -> str:
+    """Where formations break if the link of one vehicle alone is slowed."""
+    rows: list[tuple[str, ...]] = []
+    for name, vehicle in _ONE_LINK:
+        result = runner.json(f"gcs stress scenarios/{name}.toml --onset-of {vehicle}")
+        onset, curve = result["onset"], result["curve_error"]
+        cells = (_ms(onset["predicted_s"], 2), _ms(onset["loop_delay_s"], 2), f"{100 * onset['difference']:+.3f} %")
+        left = _ms(onset["link_delay_left_s"], 1)
+        rows.append((f"`{name}`", str(vehicle), _ms(result["delay_margin_s"]), *cells, _share(curve), left))
+    head = ("scenario", "vehicle", "margin", "predicted", "onset in flight", "difference", "curve", "link may take more")
+    return table(head, rows)
+
+
 def _share(curve: float | None) -> str:
     if curve is None:
         return ""

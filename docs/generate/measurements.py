@@ -36,7 +36,7 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
         *(figures.onset_chain3, figures.string_limit, figures.compare, figures.prediction_windows),
         *(figures.prediction_price, figures.prediction_flights, figures.thesis_flights),
     ),
-    "slow": (figures.onsets, figures.maps, figures.capacity, figures.copters_onset),
+    "slow": (figures.onsets, figures.one_link, figures.maps, figures.capacity, figures.copters_onset),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
         *(figures.signing, figures.design_time, figures.speed, figures.map_speed, figures.onset_real_time),

@@ -15,6 +15,7 @@ from gains.core.arrays import FloatArray
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
+from gains.sampled._carried import CarriedStates, carried_states
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
@@ -106,7 +107,8 @@ class CoupledBlock:
     """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
 
     `system_ids` names the vehicles and `loop` is their feedback; `assumed_s` is the loop delay over which the station
-    predicts, None without prediction.
+    predicts, None without prediction. `carried` is the same loop where links differ, of vehicles whose loops the
+    station closes without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -116,6 +118,7 @@ class CoupledBlock:
     timing: Timing
     loop: ClosedLoop
     assumed_s: float | None = None
+    carried: CarriedStates | None = None
 
     @property
     def has_late_terms(self) -> bool:
@@ -130,8 +133,17 @@ class CoupledBlock:
         """Real part (1/s) of the rightmost root of the continuous model; the hold counts as half a period of delay."""
         return self.growth_continuous_at_1_s(dict.fromkeys(self.system_ids, delay_s))
 
-    def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
-        """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
+    def growth_continuous_at_1_s(
+        self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None
+    ) -> float:
+        """The same where each vehicle's command has a loop delay of its own.
+
+        `age_s` has the ages of the states when the station uses them. Without them all states that a command uses are
+        taken as of one instant.
+        """
+        if age_s is not None and self.carried is not None:
+            delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
+            return self.carried.growth_1_s(delays_s, [age_s[system_id] for system_id in self.system_ids])
         known, late = self.loop.continuous_terms()
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
         entries, commands = (
@@ -140,18 +152,19 @@ class CoupledBlock:
         own = [B @ command for B, command in zip(entries, commands, strict=True)]
         return rightmost_root([*known, *zip(own, delays_s, strict=True)]).real
 
-    def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
+    def growth_at_1_s(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> float:
         """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.
 
         Exact if the delays are equal. Otherwise it is the rate at their mean, plus what their differences add in the
-        continuous model.
+        continuous model. `age_s` as of `growth_continuous_at_1_s`.
         """
         delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
         mean_s = sum(delays_s) / len(delays_s)
         rate_1_s = self.loop.growth_1_s(mean_s)
         if max(delays_s) == min(delays_s):
             return rate_1_s
-        return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
+        differing_1_s = self.growth_continuous_at_1_s(loop_delay_s, age_s)
+        return rate_1_s + differing_1_s - self.growth_continuous_1_s(mean_s)
 
     @property
     def kind(self) -> Hashable:
@@ -199,7 +212,9 @@ def coupled_blocks(
             loop = whole.part(own)
         elif assumed_s is not None:
             loop = PredictedLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
-        blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s))
+        differ = len(members) > 1 and isinstance(loop, GroundLoop)
+        carried = carried_states(model, members, *matrices) if differ else None
+        blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s, carried))
     return blocks
 
 
@@ -208,14 +223,21 @@ def unlike_blocks(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
     return list({block.kind: block for block in reversed(blocks)}.values())[::-1]
 
 
-def critical_block(blocks: Sequence[CoupledBlock], loop_delay_s: Mapping[int, float]) -> CoupledBlock:
-    """The block whose predicted growth (1/s) at the loop delays (s) of its vehicles is largest; the first in a tie."""
+def critical_block(
+    blocks: Sequence[CoupledBlock], loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None
+) -> CoupledBlock:
+    """The block whose predicted growth (1/s) at the loop delays (s) of its vehicles is largest; the first in a tie.
+
+    `age_s` as of `CoupledBlock.growth_at_1_s`.
+    """
     known: dict[Hashable, float] = {}
+    ages_s = age_s or {}
 
     def growth_1_s(block: CoupledBlock) -> float:
-        key = block.kind, tuple(round(loop_delay_s[system_id], 9) for system_id in block.system_ids)
+        both = ((loop_delay_s[own], ages_s.get(own, 0.0)) for own in block.system_ids)
+        key = block.kind, *((round(delay, 9), round(age, 9)) for delay, age in both)
         if key not in known:
-            known[key] = block.growth_at_1_s(loop_delay_s)
+            known[key] = block.growth_at_1_s(loop_delay_s, age_s)
         return known[key]
 
     return max(blocks, key=growth_1_s)

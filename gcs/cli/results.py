@@ -57,9 +57,12 @@ def print_result(result: CampaignResult, folder: Path) -> None:
         breaks = "" if onset.frequency_rad_s is None else f"; breaks at {onset.frequency_rad_s:.2f} rad/s"
         found = f"{_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight"
         console.print(f"onset    {found}{_against(result, onset)}")
+        whose = f"vehicle {onset.vehicle} alone" if onset.vehicle is not None else "every vehicle"
+        left_s = onset.link_delay_left_s
+        left = "" if left_s is None else f", {_ms(left_s, form='+.2f')} from the scenario's"
         console.print(
-            f"         {_ms(onset.link_delay_s)} of link delay, up + down: vehicle {onset.critical} waits "
-            f"{_ms(onset.waiting_s)} for the control tick{breaks}"
+            f"         {_ms(onset.link_delay_s)} of link delay, up + down, for {whose}{left}: vehicle {onset.critical} "
+            f"waits {_ms(onset.waiting_s)} for the control tick{breaks}"
         )
     if result.onset_missing:
         found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
@@ -91,6 +94,8 @@ def _against(result: CampaignResult, onset: Onset) -> str:
         return ", with no margin to compare it with"
     limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
     text = f", {onset.difference:+.3%} from the {limit} of this loop, {_ms(onset.predicted_s)}"
+    if onset.vehicle is not None and len(onset.loop) > 1:
+        text += f" for vehicle {onset.vehicle}, which vehicles {' '.join(map(str, onset.loop))} share"
     if onset.predicted_continuous_s is None:
         return text
     return f"{text}; continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
@@ -111,6 +116,7 @@ def _columns(axes: list[str]) -> dict[str, Callable[[Outcome], str]]:
     return {
         "trial": lambda point: point.id[:_ID],
         **{name: lambda point, name=name: f"{point.coordinates[name]:g}" for name in axes},
+        "vehicle": lambda point: UNKNOWN if point.critical is None else str(point.critical),
         "loop, ms": lambda point: _ms(point.loop_delay_s, unit=""),
         "growth, 1/s": lambda point: number_text(point.growth_1_s),
         "±": lambda point: number_text(point.growth_error_1_s, "0.1g"),

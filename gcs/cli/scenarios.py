@@ -136,8 +136,10 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     else:
         margin = f"margin {margin}"
     unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
+    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
+    whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
     console.print(
-        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, {margin}, "
+        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links{whose}, {margin}, "
         f"headroom {number_text(found.headroom, '.0%')}{unstable}"
     )
     if found.loop_delay_s_p99 is not None:
@@ -157,16 +159,19 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         if motion.beyond:
             console.print(_beyond_text(motion))
     console.print(plan_view({v.system_id: v.place_ne_m for v in found.vehicles}))
+    title = "places, their errors and first commands at the start, and the expected loop delays"
     columns: dict[str, Callable[[VehicleCheck], str]] = {
         "vehicle": lambda v: str(v.system_id),
         "follows": lambda v: UNKNOWN if v.follows is None else str(v.follows),
-        "place north, m": lambda v: f"{v.place_ne_m[0]:.2f}",
-        "east, m": lambda v: f"{v.place_ne_m[1]:.2f}",
-        "start error, m": lambda v: number_text(v.spacing_error_m, ".2f"),
-        "command, m/s²": lambda v: f"{v.command_m_s2:.2f}",
-        "limit": lambda v: number_text(v.command_max_m_s2, ".2f"),
+        "north\nm": lambda v: f"{v.place_ne_m[0]:.2f}",
+        "east\nm": lambda v: f"{v.place_ne_m[1]:.2f}",
+        "error\nm": lambda v: number_text(v.spacing_error_m, ".2f"),
+        "command\nm/s²": lambda v: f"{v.command_m_s2:.2f}",
+        "limit\nm/s²": lambda v: number_text(v.command_max_m_s2, ".2f"),
+        "loop\nms": lambda v: ms_text(v.expected_loop_delay_s, unit=""),
+        "headroom\nms": lambda v: ms_text(v.headroom_s, unit=""),
     }
-    console.print(table_of(found.vehicles, columns))
+    console.print(table_of(found.vehicles, columns, title=title, dense=True))
     if beyond := [v.system_id for v in found.vehicles if v.command_m_s2 > (v.command_max_m_s2 or float("inf"))]:
         console.print(
             f"limits   vehicle{'s' * (len(beyond) > 1)} {' '.join(map(str, beyond))} cannot fly the first command: "

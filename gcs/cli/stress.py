@@ -51,6 +51,10 @@ def stress(
         bool, typer.Option("--disturbance", help="raise the worst disturbance of the errors instead; needs --onset")
     ] = False,
     onset: Annotated[bool, typer.Option("--onset", help="find the delay at which the formation breaks")] = False,
+    onset_of: Annotated[
+        int | None,
+        typer.Option(metavar="ID", help="--onset, slowing the link of this vehicle alone, the others as they are"),
+    ] = None,
     tolerance: Annotated[
         float, typer.Option(metavar="FRACTION", help="how close to the onset the last flights are")
     ] = 0.02,
@@ -80,7 +84,8 @@ def stress(
 
     --delay, --delay-of, --jitter, --loss and --rate take FROM:TO:N (N values, ends included) or a list (0.1,0.2,0.4).
     One of them makes a sweep, two make a map, and --prediction maps beside each other. The loop delay is the link delay
-    plus the wait for the control tick. The measured onset is compared with the delay margin.
+    plus the wait for the control tick. The measured onset is compared with the delay margin. --onset gives all vehicles
+    links of one delay; --onset-of finds how much more one vehicle's link takes beside those of the scenario.
 
     With --disturbance and --onset, every vehicle is disturbed by w = D e, where e are the errors, at one link delay:
     that of the scenario, or one --delay. The worst D is scaled up, and the onset compared with the stability radii.
@@ -91,7 +96,7 @@ def stress(
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]
-    onset = onset or assert_onset is not None
+    onset = onset or onset_of is not None or assert_onset is not None
     if (trial or resume) and (out is None or not out.is_dir()):
         flag = "--trial" if trial else "--resume"
         raise InputError(f"--out: read {out}, wanted the folder of a campaign, which {flag} needs")
@@ -120,6 +125,8 @@ def stress(
     study, design = _study(scenario_file, loop, links, real_time=real_time, allow_code=allow_code)
     if assert_onset is not None and design.margin_unknown:
         raise InputError(f"--assert-onset: read {assert_onset:g}, wanted no such option: the margin is unknown")
+    if onset_of is not None:
+        _refuse_vehicle(onset_of, study, given)
     if trial:
         assert out is not None
         reflown = refly(study, out, trial)
@@ -140,6 +147,7 @@ def stress(
         resume=resume,
         seeds=seeds,
         tolerance=tolerance if onset else None,
+        vehicle=onset_of,
         allowed=assert_onset,
         shown=not as_json,
     )
@@ -156,6 +164,20 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, *, searches: boo
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
     if prediction and (len(given) != 2 or searches):
         raise InputError(f"--prediction: read {prediction}, wanted it with two other axes (a map) and no search")
+
+
+def _refuse_vehicle(system_id: int, study: "Study", given: list[tuple[str, str]]) -> None:
+    from gcs.stress.trial import plan_loops
+
+    known = study.plan.formation.system_ids
+    if system_id not in known:
+        raise InputError(f"--onset-of: read {system_id}, wanted one of the system ids {' '.join(map(str, known))}")
+    if given:
+        raise InputError(f"read --onset-of and {given[0][0]}, wanted one of them")
+    shared = next(loop.system_ids for loop in plan_loops(study.plan) if system_id in loop.system_ids)
+    if study.real_time and len(shared) > 1:
+        alone = f"a vehicle that shares its loop with no other, as {' '.join(map(str, shared))} do"
+        raise InputError(f"--onset-of: read {system_id} with --real-time, wanted {alone}")
 
 
 def _study(
@@ -250,6 +272,7 @@ def _campaign(
     resume: bool,
     seeds: int,
     tolerance: float | None,
+    vehicle: int | None,
     allowed: float | None,
     shown: bool,
 ) -> "tuple[CampaignResult, Path]":
@@ -286,9 +309,9 @@ def _campaign(
                 sweep = run_campaign(trials, store, fly, ended=begin("flights"))
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
-                onset = find_onset(study, run, tolerance=tolerance)
-                if study.window_s[0] > 0.0:
-                    onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True)
+                onset = find_onset(study, run, tolerance=tolerance, vehicle=vehicle)
+                if (study.window_s if vehicle is None else study.window_of(vehicle))[0] > 0.0:
+                    onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
         except NoOnset as reason:
             onset = reason
         except KeyboardInterrupt:

@@ -9,7 +9,7 @@ from pydantic import Field
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
-from gcs.plan.expected_delay import expected_loop_delay_s, late_loop_delay_s, waits_for_channels
+from gcs.plan.expected_delay import expected_loop_delays_s, late_loop_delay_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.own_law import code_by_key
@@ -32,6 +32,11 @@ class VehicleCheck(Published):
     """Magnitude of the first command, before any limit."""
     command_max_m_s2: float | None
     """The acceleration that the vehicle can fly at its initial speed; None without a limit."""
+    expected_loop_delay_s: float
+    headroom: float | None
+    """As that of the formation, at this vehicle's expected loop delay."""
+    headroom_s: float | None
+    """The same as a time: the margin less the expected loop delay. None without any margin."""
 
 
 class PlannedMotionCheck(Published):
@@ -107,12 +112,13 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             apart = np.array(ahead.position_ne_m) - vehicle.position_ne_m
             errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
     commands = plan.gain @ errors
-    limits = scenario.limits
+    limits, delays_s = scenario.limits, expected_loop_delays_s(scenario)
     vehicles: list[VehicleCheck] = []
     for row, vehicle in enumerate(ordered):
         north_m, east_m = place[row].tolist()
         turning = (limits.turn_rate_max_rad_s or inf) * hypot(*vehicle.velocity_ne_m_s)
         most = min(limits.acceleration_max_m_s2 or inf, turning)
+        margin_s, used_s = _margin_and_used_s(plan, delays_s[vehicle.system_id])
         vehicles.append(
             VehicleCheck(
                 system_id=vehicle.system_id,
@@ -121,18 +127,18 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 spacing_error_m=float(hypot(*errors[model.spacing_slice(row)])) if row else None,
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
+                expected_loop_delay_s=delays_s[vehicle.system_id],
+                headroom=_known(headroom(used_s, margin_s)),
+                headroom_s=_known(margin_s - used_s),
             )
         )
-    delay_s = expected_loop_delay_s(scenario)
+    delay_s = max(delays_s.values())
     is_predicted = scenario.control.prediction != "off"
-    known_s = {"off": 0.0, "measured": delay_s}
-    assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
+    assumed_s = _assumed_s(plan, delay_s)
     tolerated = plan.tolerance(assumed_s)
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
-    left = headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s)
     late_s = late_loop_delay_s(scenario, _LATE) if scenario.control.loop == "ground" and not is_predicted else None
-    left_late = None if late_s is None else headroom(late_s, margin_s)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
@@ -140,9 +146,9 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
         assumed_delay_s=assumed_s if is_predicted else None,
         mismatch_window_s=window_s if is_predicted and margin_s < inf else None,
-        headroom=left if isfinite(left) else None,
+        headroom=min((left for own in vehicles if (left := own.headroom) is not None), default=None),
         loop_delay_s_p99=late_s,
-        headroom_p99=left_late if left_late is not None and isfinite(left_late) else None,
+        headroom_p99=None if late_s is None else _known(headroom(late_s, margin_s)),
         closest_m=None if nearest is None else nearest.distance_m,
         closest_s=None if nearest is None else nearest.time_s,
         course=_course(scenario) if scenario.course.is_smooth else None,
@@ -151,6 +157,22 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
+
+
+def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
+    """The loop delay over which the station predicts at a loop delay; 0 without prediction."""
+    return delay_s if plan.scenario.control.prediction == "measured" else plan.assumed_s or 0.0
+
+
+def _margin_and_used_s(plan: FlightPlan, delay_s: float) -> tuple[float, float]:
+    """The margin (s), and how much of it a loop delay uses; with prediction of the distance to the window's end."""
+    assumed_s = _assumed_s(plan, delay_s)
+    tolerated = plan.tolerance(assumed_s)
+    return tolerated.longer_s[0], tolerated.used_s(0, delay_s - assumed_s)
+
+
+def _known(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def _response_differs(scenario: Scenario) -> dict[str, tuple[float | None, float | None]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gains.core.arrays import IntArray
+from gains.core.arrays import FloatArray, IntArray
 from gcs.control.phases import Phase
 from gcs.control.tick import Event, TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
@@ -136,12 +136,21 @@ def margins_of(plan: FlightPlan) -> Design:
 
 def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
     """Median of each vehicle's measured loop delay; 0 for a vehicle that was never commanded."""
-    delays: dict[int, float] = {}
+    return _medians(ticks, ticks["loop_delay_s"], system_ids)
+
+
+def median_ages_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
+    """Median age of each vehicle's states at their first use, as the station believes it; 0 if it was not commanded."""
+    return _medians(ticks, ticks["telemetry_age_s"] - ticks["repeated_s"], system_ids)
+
+
+def _medians(ticks: TickArray, values: FloatArray, system_ids: tuple[int, ...]) -> dict[int, float]:
+    found: dict[int, float] = {}
     for system_id in system_ids:
-        own = ticks["loop_delay_s"][(ticks["system_id"] == system_id) & ticks["commanded"]]
+        own = values[(ticks["system_id"] == system_id) & ticks["commanded"]]
         known = own[np.isfinite(own)]
-        delays[system_id] = float(np.median(known)) if known.size else 0.0
-    return delays
+        found[system_id] = float(np.median(known)) if known.size else 0.0
+    return found
 
 
 def first_uses(ticks: TickArray) -> TickArray:

@@ -7,6 +7,7 @@ the slowest vehicle. Where datagrams may overtake each other and jitter is as la
 faster than this.
 """
 
+from itertools import product
 from math import ceil
 
 import numpy as np
@@ -23,27 +24,35 @@ _MOST = 20_000
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:
-    """The expected loop delay (s) over the slowest links, at the slowest of their delay points.
+    """The expected loop delay (s) of the vehicle with the slowest links."""
+    return max(expected_loop_delays_s(scenario).values())
+
+
+def expected_loop_delays_s(scenario: Scenario) -> dict[int, float]:
+    """The expected loop delay (s) of each vehicle by its system id, at the slowest delay points of its links.
 
     On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
     first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams. With the loop on board, a state from the
-    slowest link up may be needed on the slowest link down. The time that datagrams wait for a channel is not included
+    happen to be. With jitter or losses it is the median over drawn datagrams. With the loop on board, a command may
+    need a state from the slowest link up of all. The time that datagrams wait for a channel is not included
     (`waits_for_channels`).
     """
-    links = [scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles]
-    if not any(link.jitter or link.loss_probability or link.loss_bursts for pair in links for link in pair):
-        if scenario.control.loop == "onboard":
-            around_s = max(up.delay_max_s for up, _ in links) + max(down.delay_max_s for _, down in links)
-        else:
-            around_s = max(up.delay_max_s + down.delay_max_s for up, down in links)
-        return around_s + 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
-    rng = np.random.default_rng(0)
-    ages = {up: _ages_s(scenario, up, rng) for up, _ in dict.fromkeys(links)}
-    downs = {down: _arrival_delays_s(scenario, down, rng) for _, down in dict.fromkeys(links)}
-    if scenario.control.loop == "onboard":
-        return max(_median_of_sum(age, down, rng) for age in ages.values() for down in downs.values())
-    return max(_median_of_sum(ages[up], downs[down], rng) for up, down in dict.fromkeys(links))
+    links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
+    unlike = dict.fromkeys(links.values())
+    ups, downs = dict.fromkeys(up for up, _ in unlike), dict.fromkeys(down for _, down in unlike)
+    streamed = scenario.control.loop == "onboard"
+    if any(link.jitter or link.loss_probability or link.loss_bursts for pair in unlike for link in pair):
+        rng = np.random.default_rng(0)
+        ages = {up: _ages_s(scenario, up, rng) for up in ups}
+        late = {down: _arrival_delays_s(scenario, down, rng) for down in downs}
+        pairs = product(ups, downs) if streamed else unlike
+        around_s = {(up, down): _median_of_sum(ages[up], late[down], rng) for up, down in pairs}
+    else:
+        waiting_s = 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
+        around_s = {(up, down): up.delay_max_s + down.delay_max_s + waiting_s for up, down in product(ups, downs)}
+    if streamed:
+        return {own: max(around_s[up, down] for up in ups) for own, (_, down) in links.items()}
+    return {own: around_s[pair] for own, pair in links.items()}
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:

@@ -261,6 +261,8 @@ def _vehicle(
         rtt_s=rtt,
         loop_delay_s=estimate(sent["loop_delay_s"]),
         delay_margin_s=MarginRange(min=margins_s.min(initial=np.inf), max=margins_s.max(initial=-np.inf)),
+        headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
+        headroom_min_s=np.fmin.reduce(_headroom_s(sent), initial=np.nan),
         up_delay_s=_one_way(sent["up_delay_s"], sent["sample_bound_s"]),
         down_delay_s=_one_way(sent["down_delay_s"], sent["down_bound_s"]),
         telemetry_age_s=estimate(sent["telemetry_age_s"]),
@@ -269,6 +271,12 @@ def _vehicle(
         mode_final=Mode(int(modes[-1])).name if modes.size else None,
         **counted,
     )
+
+
+def _headroom_s(rows: TickArray) -> FloatArray:
+    """Headroom as a time: what is left of the margin; with prediction of the distance to the window's end."""
+    with np.errstate(invalid="ignore"):  # a margin of 0, at which the headroom is minus infinity
+        return rows["headroom"] * (rows["delay_margin_s"] - rows["assumed_delay_s"])
 
 
 def estimate(values: FloatArray) -> Estimate:

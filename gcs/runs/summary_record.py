@@ -75,6 +75,8 @@ class VehicleSummary(Published):
     rtt_s: Estimate
     loop_delay_s: Estimate
     delay_margin_s: MarginRange = MarginRange(min=None, max=None)
+    headroom_min: Number = None
+    headroom_min_s: Number = None
     up_delay_s: OneWayDelay
     down_delay_s: OneWayDelay
     telemetry_age_s: Estimate
@@ -159,6 +161,12 @@ class Summary(Published):
     margin_unknown: str = ""
     law: LawRecord | None = None
     code: tuple[CodeRecord, ...] = ()
+
+    @property
+    def closest_to_margin(self) -> VehicleSummary | None:
+        """The vehicle that had the least headroom."""
+        known = [vehicle for vehicle in self.vehicles if vehicle.headroom_min is not None]
+        return min(known, key=lambda vehicle: vehicle.headroom_min or 0.0, default=None)
 
     @property
     def spacing_error_final_m(self) -> float | None:

@@ -40,8 +40,15 @@ def growth_figure(
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 241)
     # the formation's growth rate is the largest of its loops'
     above.axhline(0.0, color=LIMIT, linewidth=0.8)
-    if is_modelled(study.plan):
-        kinds = unlike_blocks(plan_loops(study.plan))
+    blocks = plan_loops(study.plan)
+    if onset is not None and onset.vehicle is not None:
+        blocks = [block for block in blocks if onset.vehicle in block.system_ids]
+    if len(blocks[0].system_ids) > 1 and onset is not None and onset.vehicle is not None:
+        order = np.argsort(delay_s)
+        label = "sampled model, the other links as in the scenario"
+        above.plot(delay_s[order], predicted[order], color=SAMPLED, linewidth=1.4, label=label)
+    elif is_modelled(study.plan):
+        kinds = unlike_blocks(blocks)
         sampled = np.array([[kind.loop.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds])
         fastest, some_s = [kinds[k] for k in sampled.argmax(axis=0)[::_SPARSE]], grid_s[::_SPARSE]
         continuous = [kind.growth_continuous_1_s(at) for kind, at in zip(fastest, some_s.tolist(), strict=True)]
@@ -50,7 +57,7 @@ def growth_figure(
     style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
     above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
     _mark_own(above, own)
-    margin_s = study.window_s[1]
+    margin_s = study.window_s[1] if onset is None or onset.vehicle is None else onset.predicted_s or np.inf
     if grid_s[0] <= margin_s <= grid_s[-1]:
         above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
         at = (margin_s, float(measured.min()))

@@ -7,7 +7,8 @@ growth can be read only after a long time.
 
 A probe removes everything that would mask this response:
 
-* Clock drift moves the sampling instants, and with them the loop delay while it is being measured.
+* Clock drift moves the sampling instants, and with them the loop delay while it is being measured. It remains only
+  on links that lose or delay at random, where delays vary in any case.
 * Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
   it would see errors of up to v T where there are none, and push every vehicle at the start. A probe gives all vehicles
   the same clock: they sample at the same instant, and this error is absent. The probed loop's wait for the control tick
@@ -174,15 +175,18 @@ def _alike(rows: TickArray, others: TickArray) -> int:
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with all vehicles in place at nominal velocity, except for an error of the given ones.
 
-    No vehicle enters its failsafe or meets a limit. The error is in the position of a follower (m), and in the velocity
-    of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
-    vehicle. Vehicles with autopilots begin at rest: their nominal velocity is zero, or the reverse of the leader's
-    error, which disturbs the followers, too; those outside the loop do not act on it.
+    No vehicle enters its failsafe or meets a limit, and on constant links clocks do not drift. The error is in the
+    position of a follower (m), and in the velocity of the leader (m/s), whose position is not controlled. It points in
+    `_DIRECTION_NE` and differs from vehicle to vehicle. Vehicles with autopilots begin at rest: their nominal velocity
+    is zero, or the reverse of the leader's error, which disturbs the followers, too; those outside the loop do not act
+    on it.
     """
     scenario, place, duration_s = plan.scenario.in_steady_flight(), plan.formation.place_ne_m(), PROBE_S
     if scenario.dynamics == "autopilot":
         scenario, duration_s = _at_rest(scenario), PROBE_S if plan.assumed_s is None else _HIDDEN_MODE_S
-    if not has_constant_links(scenario) and isfinite(plan.delay_margin_s):
+    if has_constant_links(scenario):
+        scenario = scenario.model_copy(update={"clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})})
+    elif isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []

@@ -8,7 +8,7 @@ not the actions that keep a flight within it.
 
 import time  # noqa: TID251 - how long a trial takes is only reported; nothing flown depends on it
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from gains.sampled.coupled_block import CoupledBlock, critical_block
-from gcs.control.tick import chosen
-from gcs.drive.flown import first_uses, fly_plan, median_delays_s
+from gcs.control.tick import TickArray, chosen
+from gcs.drive.flown import first_uses, fly_plan, median_ages_s, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
 from gcs.stress import free_response
@@ -75,10 +75,20 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 
 
 def _needs_pair(trial: Trial) -> bool:
-    """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays."""
+    """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays.
+
+    It does on links that vary, and where the links of other vehicles matter: those of one loop, or all if the link of
+    the probed vehicle alone was slowed.
+    """
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
     coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
-    return not trial.real_time and (not has_constant_links(trial.scenario) or (coupled and len(links) > 1))
+    alone = _is_varied(trial.probe, dict(trial.coordinates))
+    return not trial.real_time and (not has_constant_links(trial.scenario) or (len(links) > 1 and (coupled or alone)))
+
+
+def _is_varied(probe: int, coordinates: Mapping[str, float]) -> bool:
+    """Whether the delay of the probed vehicle's own link is what the campaign varies."""
+    return f"delay_{probe}" in coordinates
 
 
 def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
@@ -87,10 +97,11 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     outcome = with_verdict(plan, flight, outcome)
     flown = chosen(flight.ticks, flight.ticks["time_s"] >= 0.0)
     delays_s = median_delays_s(flown, plan.formation.system_ids)
-    loop = critical_block(plan_loops(plan), delays_s)
-    loop_s, link_s, _ = _slowest(plan, loop, delays_s)
+    ages_s = _ages_s(plan, flown)
+    loop = critical_block(plan_loops(plan), delays_s, ages_s)
+    loop_s, link_s, _ = _delays_of(plan, loop, delays_s, outcome)
     outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s, loop_delay_s=round(loop_s, 9))
-    outcome = _with_prediction(outcome, plan, loop, delays_s)
+    outcome = _with_prediction(outcome, plan, loop, delays_s, ages_s)
     start_s = _BEGUN_LOOP_DELAYS * loop_s
     growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
     return outcome if growth is None else _with_fit(outcome, growth)
@@ -109,7 +120,7 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     delays_s, loops = median_delays_s(fresh, base.formation.system_ids), plan_loops(base)
     critical = _loop_of(loops, delays_s, trial.probe)
     probed = next(loop for loop in loops if loop.kind == critical.kind) if trial.probe == CRITICAL else critical
-    waiting_s = _slowest(base, critical, delays_s)[2] % critical.timing.step_s
+    waiting_s = _delays_of(base, critical, delays_s, outcome)[2] % critical.timing.step_s
     up, down = links = base.scenario.link_of(critical.system_ids[0])
     outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=round(waiting_s, 9))
 
@@ -126,8 +137,8 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     base = plan_of(trial)
     calm = free_response.fly_calm(base, _folder_of(folder, 0.0))
     delays_s = free_response.effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
-    probed = _loop_of(plan_loops(base), delays_s, trial.probe)
-    _, link_s, waiting_s = _slowest(base, probed, delays_s)
+    probed = _loop_of(plan_loops(base), delays_s, trial.probe, _ages_s(base, calm.ticks))
+    _, link_s, waiting_s = _delays_of(base, probed, delays_s, outcome)
     past = free_response.past_limits(base.scenario, chosen(calm.ticks, calm.ticks["commanded"]))
     outcome = replace(outcome, link_delay_s=link_s, waiting_s=round(waiting_s, 9), past_limits=past)
 
@@ -172,28 +183,54 @@ def _with_response(
     return outcome
 
 
-def _loop_of(loops: list[CoupledBlock], loop_delay_s: dict[int, float], probe: int) -> CoupledBlock:
+def _loop_of(
+    loops: list[CoupledBlock],
+    loop_delay_s: Mapping[int, float],
+    probe: int,
+    age_s: Mapping[int, float] | None = None,
+) -> CoupledBlock:
     """The loop of a vehicle, or the one that is predicted to break first."""
     if probe == CRITICAL:
-        return critical_block(loops, loop_delay_s)
+        return critical_block(loops, loop_delay_s, age_s)
     return next(loop for loop in loops if probe in loop.system_ids)
 
 
-def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> tuple[float, float, float]:
-    """Loop delay, link delay (up plus down) and their difference (s) for a loop's vehicle of longest loop delay."""
-    slowest = max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
-    up, down = plan.scenario.link_of(slowest)
-    longest_s = loop_delay_s[slowest]
-    return longest_s, up.delay_s + down.delay_s, longest_s - up.delay_s - down.delay_s
+def _named_vehicle(loop: CoupledBlock, loop_delay_s: Mapping[int, float], outcome: Outcome) -> int:
+    """The vehicle whose delays are stated for its loop: the one whose link was slowed alone, or the slowest."""
+    if outcome.probe in loop.system_ids and _is_varied(outcome.probe, outcome.coordinates):
+        return outcome.probe
+    return max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
 
 
-def _with_prediction(outcome: Outcome, plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> Outcome:
+def _delays_of(
+    plan: FlightPlan, loop: CoupledBlock, loop_delay_s: Mapping[int, float], outcome: Outcome
+) -> tuple[float, float, float]:
+    """Loop delay, link delay (up plus down) and their difference (s) of a loop's `_named_vehicle`."""
+    vehicle = _named_vehicle(loop, loop_delay_s, outcome)
+    up, down = plan.scenario.link_of(vehicle)
+    delay_s = loop_delay_s[vehicle]
+    return delay_s, up.delay_s + down.delay_s, delay_s - up.delay_s - down.delay_s
+
+
+def _ages_s(plan: FlightPlan, rows: TickArray) -> dict[int, float] | None:
+    """The ages of the states at the station, which matter where the vehicles' links differ; else None."""
+    ids = plan.formation.system_ids
+    return median_ages_s(rows, ids) if len({plan.scenario.link_of(own) for own in ids}) > 1 else None
+
+
+def _with_prediction(
+    outcome: Outcome,
+    plan: FlightPlan,
+    loop: CoupledBlock,
+    loop_delay_s: Mapping[int, float],
+    age_s: Mapping[int, float] | None,
+) -> Outcome:
     if not is_modelled(plan):
         return outcome
     return replace(
         outcome,
-        predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(loop_delay_s)),
+        predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s, age_s)),
+        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(loop_delay_s, age_s)),
     )
 
 
@@ -219,9 +256,9 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
     delays_s = response.loop_delays_s(window, loop.system_ids)
     spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
-    loop_s = round(max(delays_s.values()), 9)
+    loop_s = round(delays_s[_named_vehicle(loop, delays_s, outcome)], 9)
     outcome = replace(_with_fit(outcome, growth), loop_delay_s=loop_s, loop_delay_spread_s=round(spread_s, 9))
-    return _with_prediction(outcome, response.plan, loop, delays_s)
+    return _with_prediction(outcome, response.plan, loop, delays_s, _ages_s(response.plan, window))
 
 
 def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:

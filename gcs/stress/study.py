@@ -1,15 +1,16 @@
 """Which trials a campaign flies: over its axes, and in search of the onset."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import Annotated
 
 import numpy as np
 from pydantic import PlainSerializer
 
-from gains.sampled.coupled_block import unlike_blocks
+from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
+from gcs.plan.expected_delay import expected_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
@@ -25,6 +26,8 @@ _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
 """Half widths of the first and the finest round of an onset search, in tolerances."""
+_ALONE_STEP, _ALONE_STEPS = 0.1, 100
+"""Steps, in margins of the whole loop, in which the margin of one of its vehicles is searched, and their number."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
@@ -41,6 +44,43 @@ class Study:
         """The loop delays between which the plan is predicted to be stable; without prediction the first is 0."""
         assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
+
+    def window_of(self, system_id: int) -> Window:
+        """The loop delays of one vehicle between which its loop is predicted to be stable.
+
+        The links of all other vehicles stay as they are in the scenario. Where these share a loop with the vehicle, the
+        window is known roughly: from a line through the growth at steps from the loop delay that is expected of it.
+        """
+        block = next(block for block in plan_loops(self.plan) if system_id in block.system_ids)
+        if not is_modelled(self.plan):
+            return self.window_s
+        if len(block.system_ids) == 1:
+            return block.loop.window_s()
+        expected_s = expected_loop_delays_s(self.plan.scenario)
+        now_s = expected_s[system_id]
+
+        def growth_1_s(delay_s: float) -> float:
+            return _expected_growth_1_s(block, expected_s | {system_id: delay_s})
+
+        def edge_s(step_s: float, end_s: float) -> float:
+            at_s, rate_1_s = now_s, growth_1_s(now_s)
+            for k in range(1, _ALONE_STEPS):
+                inner_s, inner_1_s, at_s = at_s, rate_1_s, now_s + k * step_s
+                if at_s <= 0.0:
+                    return end_s
+                rate_1_s = growth_1_s(at_s)
+                if rate_1_s >= 0.0:
+                    return inner_s + (at_s - inner_s) * inner_1_s / (inner_1_s - rate_1_s)
+            return end_s
+
+        step_s = _ALONE_STEP * block.margin_s()
+        return (0.0, 0.0) if growth_1_s(now_s) >= 0.0 else (edge_s(-step_s, 0.0), edge_s(step_s, np.inf))
+
+    def unstable_beside(self, system_id: int) -> list[int]:
+        """The vehicles outside a vehicle's loop that are predicted to be unstable over the links of the scenario."""
+        expected_s = expected_loop_delays_s(self.plan.scenario)
+        others = [b for b in plan_loops(self.plan) if is_modelled(self.plan) and system_id not in b.system_ids]
+        return [own for block in others if _expected_growth_1_s(block, expected_s) >= 0.0 for own in block.system_ids]
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
         """The trial at one point. `seed` is the scenario's, from which clocks, jitter and loss are drawn."""
@@ -69,6 +109,12 @@ class Study:
         return [self.trial(kind, point, seed=first + k) for kind, point, k in product(kinds, points, range(seeds))]
 
 
+def _expected_growth_1_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
+    """The growth at expected loop delays: a state is at the station after half of the link delay and of the waiting."""
+    waiting_s = block.timing.faster_s / 2.0
+    return block.growth_at_1_s(loop_delay_s, {own: (at_s + waiting_s) / 2.0 for own, at_s in loop_delay_s.items()})
+
+
 _Flights = tuple[Annotated[Outcome, PlainSerializer(lambda outcome: outcome.id)], ...]
 """Outcomes, which JSON names by their ids."""
 
@@ -79,7 +125,10 @@ class Onset:
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
     down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
-    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
+    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1. `vehicle` is
+    the vehicle whose link alone was slowed, which is then the one meant everywhere here, and `link_delay_left_s` how
+    much longer its link delay may be than in the scenario; both are None if all links were slowed alike. `loop` has the
+    vehicles of the loop that breaks.
     `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. None where there is
     no model: of a law that is not linear, or of dynamics of one's own.
     """
@@ -99,6 +148,9 @@ class Onset:
     flights: _Flights
     checks: _Flights
     """Probes of the other kinds of loops and of the last vehicle, at the onset."""
+    vehicle: int | None
+    link_delay_left_s: float | None
+    loop: tuple[int, ...]
     own: _Flights
     """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction, at ± half the mismatch there."""
 
@@ -114,24 +166,28 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
         self.as_predicted = as_predicted
 
 
-def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = False) -> Onset:
+def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = False, vehicle: int | None = None) -> Onset:
     """Fly probes ever closer around the predicted onset, until the zero of their growth rates is located.
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
     the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
-    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. Raises
-    NoOnset with the reason.
+    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. The link
+    of `vehicle` alone is slowed, or all links alike. Raises NoOnset with the reason.
     """
-    expected_s, way = study.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
+    slowed = _Slowed(study, vehicle)
+    expected_s, way = slowed.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
+    if vehicle is not None and (unstable := study.unstable_beside(vehicle)):
+        who = f"vehicle{'s' * (len(unstable) > 1)} {' '.join(map(str, unstable))}"
+        raise NoOnset(f"the links of the scenario alone make {who} unstable, by prediction")
     if expected_s == np.inf:
-        raise _no_limit(study, run, tolerance=tolerance)
+        raise _no_limit(slowed, run, tolerance=tolerance)
     if expected_s <= 0.0:
         raise NoOnset(f"the predicted margin is {expected_s:g} s: there is no delay at which it is stable")
     first_seed = study.plan.scenario.seed
     centre_s, width_s = expected_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * expected_s
     if np.isnan(expected_s):
-        found = bracketed(lambda link_s: study.trial("probe", {"delay": link_s}, seed=first_seed), run)
+        found = bracketed(partial(slowed.probe, seed=first_seed), run)
         if isinstance(found, str):
             raise NoOnset(found)
         expected_s, width_s = (found[0] + found[1]) / 2.0, (found[1] - found[0]) / 2.0
@@ -145,7 +201,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         # On random links each flight draws its own delays. With the same draws all rates would have the same error,
         # which their scatter could not show.
         trials = [
-            study.trial("probe", {"delay": link_s}, seed=first_seed + (len(flights) + k if random_links else 0))
+            slowed.probe(link_s, seed=first_seed + (len(flights) + k if random_links else 0))
             for k, link_s in enumerate(links_s)
         ]
         flown = run(trials)
@@ -167,7 +223,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         wanted_s = tolerance * expected_s
         close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
         if zero.inside and close and width_s <= 1.001 * wanted_s:
-            return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number, shorter=shorter)
+            return _found(slowed, run, zero, near, tuple(flights.values()), rounds=round_number, shorter=shorter)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
         # at most twice the width at once: extrapolating farther would be a guess
@@ -182,9 +238,28 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     )
 
 
-def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
+@dataclass(frozen=True)
+class _Slowed:
+    """The links that a search slows down: those of one vehicle, or all alike."""
+
+    study: Study
+    vehicle: int | None
+
+    @property
+    def window_s(self) -> Window:
+        return self.study.window_s if self.vehicle is None else self.study.window_of(self.vehicle)
+
+    def at(self, link_s: float) -> dict[str, float]:
+        """The coordinates of a link delay, up plus down."""
+        return {"delay" if self.vehicle is None else f"delay_{self.vehicle}": link_s}
+
+    def probe(self, link_s: float, *, seed: int) -> Trial:
+        return self.study.trial("probe", self.at(link_s), seed=seed, probe=self.vehicle or CRITICAL)
+
+
+def _no_limit(slowed: _Slowed, run: Run, *, tolerance: float) -> NoOnset:
     """Fly a loop that no delay is predicted to break, and say what the flights show."""
-    flown = run([study.trial("probe", {"delay": d}, seed=study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
+    flown = run([slowed.probe(d, seed=slowed.study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
     known = _growth_pairs(flown)
     off = max((abs(measured - predicted) / abs(predicted) for measured, predicted in known), default=np.inf)
     steady = len(known) == len(flown) and off <= tolerance and all(measured < 0.0 for measured, _ in known)
@@ -225,7 +300,7 @@ def _waiting_s(outcomes: Sequence[Outcome]) -> float:
 
 
 def _found(
-    study: Study,
+    slowed: _Slowed,
     run: Run,
     zero: Zero,
     near: Sequence[Outcome],
@@ -234,7 +309,7 @@ def _found(
     rounds: int,
     shorter: bool,
 ) -> Onset:
-    blocks = plan_loops(study.plan)
+    study, vehicle, blocks = slowed.study, slowed.vehicle, plan_loops(slowed.study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.varied))
     assert nearest.probed is not None
     assert nearest.critical is not None
@@ -244,34 +319,52 @@ def _found(
     # for the loop that breaks first, test the figure that the station flies by
     own_s = block.loop.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
+    continuous_s = block.loop.window_continuous_s()[end] if is_modelled(study.plan) else None
+    if vehicle is not None and len(block.system_ids) > 1:  # the margin depends on the delays of the others
+        predicted_s, continuous_s = (
+            _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")
+        )
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.varied - waiting_s)
     seed = study.plan.scenario.seed
-    at_onset = {"delay": round(link_s, 6)}
+    at_onset = slowed.at(round(link_s, 6))
     others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     # with prediction, stay away from the other end of the window
     aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
     beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
-    own = run([study.trial("own", {"delay": delay_s}, seed=seed) for delay_s in beside_s])
+    own = run([study.trial("own", slowed.at(delay_s), seed=seed) for delay_s in beside_s])
+    links = () if vehicle is None else study.plan.scenario.link_of(vehicle)
     return Onset(
         loop_delay_s=zero.varied,
         error_s=zero.error,
         predicted_s=None if np.isnan(predicted_s) else predicted_s,
-        predicted_continuous_s=block.loop.window_continuous_s()[end] if is_modelled(study.plan) else None,
+        predicted_continuous_s=continuous_s,
         difference=None if np.isnan(predicted_s) else zero.varied / predicted_s - 1.0,
         link_delay_s=link_s,
         waiting_s=waiting_s,
         slope_1_s2=zero.slope,
         frequency_rad_s=_median([o.frequency_rad_s for o in near if o.frequency_rad_s is not None]),
         probed=nearest.probed,
-        critical=nearest.critical,
+        critical=nearest.critical if vehicle is None else vehicle,
         rounds=rounds,
         flights=tuple(sorted(flights, key=lambda outcome: outcome.link_delay_s or 0.0)),
         checks=tuple(checks),
+        vehicle=vehicle,
+        loop=block.system_ids,
+        link_delay_left_s=link_s - sum(link.delay_max_s for link in links) if links else None,
         own=tuple(own),
     )
+
+
+def _zero_of(flights: Sequence[Outcome], growth: str, way: float) -> float:
+    """The loop delay (s) at which a growth rate that is predicted for these flights passes zero; NaN if it does not."""
+    known = [(o.loop_delay_s, getattr(o, growth)) for o in flights]
+    zero = locate_zero(
+        [GrowthPoint(way * at_s, rate, 0.0) for at_s, rate in known if at_s is not None and rate is not None]
+    )
+    return np.nan if zero is None else way * zero.varied
 
 
 def bracketed(trial_at: Callable[[float], Trial], run: Run) -> tuple[float, float] | str:

@@ -52,8 +52,7 @@ def leave_report(folder: Path, summary: Summary) -> Summary:
 def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> str:
     """The page, as HTML; `ticks` have shape (ticks, vehicles)."""
     flown = ticks[ticks["time_s"][:, 0] >= 0.0] if ticks.size else ticks
-    least = _least_headroom(flown)
-    named = _named(least)
+    named = _named([vehicle.headroom_min for vehicle in summary.vehicles])
     labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
     modes = _mode_bars(flown, labels)
     shown = {name for _, bar in modes for name, _, _ in bar}
@@ -69,16 +68,9 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
         others=len(labels) - len(named),
         modes=modes,
         mode_key=[(mode.name, colour) for mode, colour in _MODE_COLOURS.items() if mode.name in shown],
-        headroom_min={vehicle.system_id: left for vehicle, left in zip(scenario.vehicles, least, strict=True)},
         events=said[:_MOST_EVENTS],
         left_out=max(0, len(said) - _MOST_EVENTS),
     )
-
-
-def _least_headroom(flown: TickArray) -> list[float | None]:
-    """Of each vehicle, None where it is unknown."""
-    least = np.fmin.reduce(np.where(flown["commanded"], flown["headroom"], np.nan), axis=0, initial=np.nan)
-    return [float(value) if np.isfinite(value) else None for value in np.atleast_1d(least)]
 
 
 def _named(least: Sequence[float | None]) -> list[int]:

@@ -199,11 +199,12 @@ _BLOCK_COLUMNS: dict[str, Callable[[GainBlock], str]] = {
 """The gain matrix by blocks: which vehicle uses whose errors, with which gain."""
 _VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
     "vehicle": lambda own: str(own.system_id),
-    "final error, m": lambda own: number_text(own.spacing_error_final_m, ".2f"),
-    "largest, m": lambda own: number_text(own.spacing_error_max_m, ".2f"),
-    "RTT p50, ms": lambda own: ms_text(own.rtt_s.p50, unit=""),
-    "loop p50, ms": lambda own: ms_text(own.loop_delay_s.p50, unit=""),
-    "p99, ms": lambda own: ms_text(own.loop_delay_s.p99, unit=""),
+    "error, m\nlargest": lambda own: number_text(own.spacing_error_max_m, ".2f"),
+    "\nfinal": lambda own: number_text(own.spacing_error_final_m, ".2f"),
+    "RTT p50\nms": lambda own: ms_text(own.rtt_s.p50, unit=""),
+    "loop p50\nms": lambda own: ms_text(own.loop_delay_s.p50, unit=""),
+    "p99\nms": lambda own: ms_text(own.loop_delay_s.p99, unit=""),
+    "headroom\nms": lambda own: ms_text(own.headroom_min_s, unit=""),
     "lost": lambda own: number_text(own.lost, "d"),
     "late": lambda own: number_text(own.late, "d"),
 }
@@ -262,7 +263,7 @@ def print_flight(summary: Summary, console: Console) -> None:
             console.print(f"refused  by the {who}: {in_words(counts)}")
     if summary.mirror:
         console.print(f"mirror   {in_words(summary.mirror)}")
-    console.print(table_of(summary.vehicles, _VEHICLE_COLUMNS))
+    console.print(table_of(summary.vehicles, _VEHICLE_COLUMNS, dense=True))
 
 
 def _spread_text(spread: FlownSpread) -> str:
@@ -296,12 +297,18 @@ def delay_text(summary: Summary) -> str:
     if margin_s is not None and slowest_s > margin_s:
         way = "slower gains" if summary.prediction == "off" else "prediction"
         margin += f", up to {ms_text(slowest_s)} with {way}"
-    bound_s = summary.loop_delay_bound_s
+    bound_s, closest = summary.loop_delay_bound_s, summary.closest_to_margin
     error = "" if bound_s is None else f" (clocks: ± {ms_text(bound_s)})"
     return (
         f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max{error}; "
-        f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}"
+        f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}{'' if closest is None else _of(closest)}"
     )
+
+
+def _of(closest: VehicleSummary) -> str:
+    """Whose headroom it is, and how much longer its loop delay could have been."""
+    left = "" if closest.headroom_min_s is None else f": {ms_text(closest.headroom_min_s)}"
+    return f" (vehicle {closest.system_id}{left})"
 
 
 def response_text(response: ResponsePart | None) -> str:

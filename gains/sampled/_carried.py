@@ -1,0 +1,90 @@
+"""Vehicles of one loop whose links differ: the station carries the states of slower links forward.
+
+A command of vehicle i acts tau_i after its state was sampled. The states of others that it uses are brought to the
+instant of that sample. One that is older, delta_ij = max(0, a_j − a_i) with a the age of the newest states at the
+station, is extrapolated at constant velocity; one that is newer is interpolated between reports. Hence
+
+    u_i(t) = sum_j G_ij (p_j + delta_ij v_j, v_j)(t − tau_i − delta_ij)
+
+in positions p and velocities v of the vehicles. The ages are those that the station believes: an error of its estimate
+of vehicle j's clock shifts j in time for all others alike, and back for j's own commands, which moves no root.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gains.core.arrays import FloatArray, IntArray
+from gains.delay.rightmost import rightmost_roots
+from gains.formation.model import FormationModel
+
+_AT_ZERO = 1e-6
+"""A root (1/s) nearer to zero is the formation's freedom to be anywhere, which the positions bring with them."""
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedStates:
+    """x' = A x + B u, u = G x: positions and velocities of the vehicles of a block, then what else moves them.
+
+    `positions` and `velocities` have the places of each vehicle's in x, (vehicles, axes), `inputs` those in u.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    G: FloatArray
+    positions: IntArray
+    velocities: IntArray
+    inputs: IntArray
+
+    def growth_1_s(self, delays_s: Sequence[float], ages_s: Sequence[float]) -> float:
+        """Real part (1/s) of the rightmost root with these tau and a (s) of the vehicles."""
+        vehicles, axes = self.inputs.shape
+        terms: list[tuple[FloatArray, float]] = [(self.A, 0.0)]
+        for i in range(vehicles):
+            entry = self.B[:, self.inputs[i]]
+            for j in range(vehicles):
+                from_position, from_velocity = (
+                    entry @ self.G[np.ix_(self.inputs[i], places[j])] for places in (self.positions, self.velocities)
+                )
+                older_s = max(0.0, ages_s[j] - ages_s[i])
+                term = np.zeros_like(self.A)
+                term[:, self.positions[j]] = from_position
+                term[:, self.velocities[j]] = from_velocity + older_s * from_position
+                if term.any():
+                    terms.append((term, delays_s[i] + older_s))
+        roots = rightmost_roots(terms, 1 + axes)
+        return float(max(root.real for root in roots if abs(root) > _AT_ZERO))
+
+
+def carried_states(
+    model: FormationModel, members: Sequence[int], A: FloatArray, B: FloatArray, K: FloatArray
+) -> CarriedStates:
+    """The members of a formation that share a loop: e' = A e + B u, u = K e in positions instead of spacing errors.
+
+    The states are the errors of each member in turn, and whatever follows them.
+    """
+    axes, vehicles = model.axes, len(members)
+    errors = np.cumsum([0, *(model.axes * (1 + (i > 0)) for i in members)])
+    n = len(A) + axes * (0 in members)  # the leader's position is no error of its own
+    # x: the positions of all members, then all other states of e in their order
+    spacing = np.concatenate([np.arange(at, at + axes) for at, i in zip(errors, members, strict=False) if i > 0])
+    others = np.setdiff1d(np.arange(len(A)), spacing)
+    positions = np.arange(axes * vehicles).reshape(vehicles, axes)
+    place = np.zeros(len(A), int)
+    place[others] = positions.size + np.arange(others.size)
+    own_velocity = np.array([np.arange(end - axes, end) for end in errors[1:]])
+    error_of = np.zeros((len(A), n))
+    error_of[others, place[others]] = 1.0
+    rows = dict(zip([i for i in members if i > 0], spacing.reshape(-1, axes), strict=True))
+    for k, i in enumerate(members):
+        if i in rows:
+            error_of[rows[i], positions[k]] = -1.0
+            if model.predecessors[i] in members:
+                error_of[rows[i], positions[members.index(model.predecessors[i])]] = 1.0
+    moved, entry = np.zeros((n, n)), np.zeros((n, B.shape[1]))
+    moved[np.ix_(place[others], place[others])] = A[np.ix_(others, others)]
+    moved[positions, place[own_velocity]] = 1.0
+    entry[place[others]] = B[others]
+    inputs = np.arange(B.shape[1]).reshape(vehicles, axes)
+    return CarriedStates(moved, entry, K @ error_of, positions, place[own_velocity], inputs)

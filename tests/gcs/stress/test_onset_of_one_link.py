@@ -1,0 +1,108 @@
+"""The onset where the link of one vehicle alone is slowed, and the model of loops whose links differ."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gcs.cli.main import app
+from gcs.drive.check import check
+from gcs.errors import InputError
+from gcs.plan.planner import flight_plan
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import NoOnset, Onset, Study, find_onset
+from gcs.stress.trial import plan_loops
+from scenarios.files import dump, load
+from scenarios.keys.link import Link, VehicleLinks
+from scenarios.schema import Scenario
+from scenarios.shipped import located
+from tests.support.fleets.stress_pair import SCENARIO
+
+
+def with_links(scenario: Scenario, **delays_s: float) -> Scenario:
+    """The scenario over constant links: each way `delay_s`, and another one for vehicles named `v2=` and so on."""
+    vehicles = tuple(
+        VehicleLinks(system_id=int(name[1:]), up=Link(delay_s=own_s), down=Link(delay_s=own_s))
+        for name, own_s in delays_s.items()
+        if name != "all"
+    )
+    both = Link(delay_s=delays_s["all"])
+    links = scenario.links.model_copy(update={"up": both, "down": both, "vehicles": vehicles})
+    return scenario.model_copy(update={"links": links})
+
+
+def study_of(scenario: Scenario) -> Study:
+    return Study(flight_plan(scenario.with_calm_monitor())[1])
+
+
+def onset_of(scenario: Scenario, vehicle: int) -> Onset:
+    return find_onset(study_of(scenario), lambda trials: list(map(fly_trial, trials)), tolerance=0.02, vehicle=vehicle)
+
+
+def test_a_link_alone_breaks_its_loop_at_the_loops_margin() -> None:
+    """The other vehicle's link differs, and clocks run at rates of their own."""
+    onset = onset_of(with_links(SCENARIO, all=0.03, v2=0.06), 2)
+    [leader, follower] = plan_loops(study_of(SCENARIO).plan)
+    assert onset.predicted_s == pytest.approx(follower.margin_s())
+    assert follower.margin_s() < 0.9 * leader.margin_s()
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # 3e-5
+    assert onset.link_delay_left_s == pytest.approx(onset.link_delay_s - 0.12)
+    assert (onset.vehicle, onset.critical, onset.loop) == (2, 2, (2,))
+
+
+@pytest.mark.parametrize("vehicle", [1, 2])
+def test_a_loop_with_unlike_links_breaks_where_its_model_does(vehicle: int) -> None:
+    """A platoon that looks back as well. A model without extrapolation is 7 and 13 % off."""
+    scenario = with_links(load(located("chain3_bidirectional")), all=0.02)
+    onset = onset_of(scenario, vehicle)
+    assert onset.predicted_s is not None
+    assert onset.loop == (1, 2, 3)
+    assert onset.loop_delay_s > 1.3 * study_of(scenario).plan.delay_margin_s  # alone, a link may be slower than all
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=1.5e-3)  # 7e-4 and 1e-4
+
+
+def test_states_of_one_age_leave_one_delay_for_each_command() -> None:
+    """The model in positions beside the one in errors, which has no ages."""
+    [block] = plan_loops(study_of(load(located("chain3_bidirectional"))).plan)
+    delays_s = dict(zip(block.system_ids, (0.25, 0.31, 0.2), strict=True))
+    alike = dict.fromkeys(block.system_ids, 0.1)
+    wanted_1_s = block.growth_continuous_at_1_s(delays_s)
+    assert block.growth_continuous_at_1_s(delays_s, alike) == pytest.approx(wanted_1_s, rel=1e-9)
+    older = alike | {2: 0.2}
+    assert block.growth_continuous_at_1_s(delays_s, older) != pytest.approx(wanted_1_s, rel=1e-2)
+
+
+def test_links_that_break_another_loop_leave_no_onset_to_find() -> None:
+    with pytest.raises(NoOnset, match="the links of the scenario alone make vehicle 2 unstable"):
+        onset_of(with_links(SCENARIO, all=0.03, v2=0.4), 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["--onset-of", "9"], "--onset-of: read 9, wanted one of the system ids 1 2 3"),
+        (["--onset-of", "2", "--delay", "0.1"], "read --onset-of and --delay, wanted one of them"),
+        (["--onset-of", "2", "--real-time"], "wanted a vehicle that shares its loop with no other"),
+    ],
+)
+def test_onsets_of_no_single_link_are_refused(options: list[str], wanted: str) -> None:
+    result = CliRunner().invoke(app, ["stress", "chain3_bidirectional", *options])
+    assert isinstance(result.exception, InputError)
+    assert wanted in str(result.exception)
+
+
+def test_what_is_printed_names_the_vehicle_and_what_is_left(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    scenario = tmp_path / "pair.toml"
+    scenario.write_text(dump(with_links(SCENARIO, all=0.03, v2=0.06)), encoding="utf-8")
+    result = CliRunner().invoke(app, ["stress", str(scenario), "--onset-of", "2", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "for vehicle 2 alone, +" in result.output
+    assert "The link of vehicle 2 alone may take" in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_check_has_the_headroom_of_each_vehicle() -> None:
+    found = check(flight_plan(with_links(load(located("chain3")), all=0.02, v3=0.09))[1])
+    assert [own.expected_loop_delay_s for own in found.vehicles] == pytest.approx([0.05, 0.05, 0.19])
+    assert [own.headroom_s for own in found.vehicles] == pytest.approx([0.25, 0.25, 0.11])
+    assert found.headroom == found.vehicles[2].headroom == pytest.approx(0.11 / 0.3)
