@@ -268,8 +268,10 @@ def _no_limit(slowed: _Slowed, run: Run, *, tolerance: float) -> NoOnset:
     if not known:
         return NoOnset(f"{said} no growth rate could be measured")
     slowest, expected = max(known)
+    unknown = f"; {len(flown) - len(known)} flights have no growth rate" if len(known) < len(flown) else ""
     return NoOnset(
-        f"{said} errors decay at {-slowest:.5f} 1/s or faster, predicted {-expected:.5f} 1/s, at most {off:.3%} apart",
+        f"{said} errors decay at {-slowest:.5f} 1/s or faster, predicted {-expected:.5f} 1/s, at most {off:.3%} "
+        f"apart{unknown}",
         as_predicted=steady,
     )
 
