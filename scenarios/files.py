@@ -3,7 +3,6 @@
 Every fault is a ScenarioError: one line with file, key, what was read and what was wanted.
 """
 
-import difflib
 import hashlib
 import itertools
 import math
@@ -16,16 +15,17 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
-from scenarios.errors import ScenarioError, UnreadableError
+from scenarios.errors import InWords, ScenarioError, UnreadableError, did_you_mean
 from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link, Links
 from scenarios.keys.part import Fault
 from scenarios.link_files import each_link, load_profile, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code
-from scenarios.places import line_of, location_of, named, wanted_of
+from scenarios.places import place_of, wanted_of
 from scenarios.requirements import contradictions as requirement_contradictions
 from scenarios.schema import Scenario
+from scenarios.shipped import names
 
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
 
@@ -38,6 +38,9 @@ def load(path: Path) -> Scenario:
     """
     try:
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        wanted = "a scenario file or the name of one (see gcs scenarios)"
+        raise UnreadableError(path, "no such file", wanted + did_you_mean(path.stem, names())) from None
     except IsADirectoryError:
         raise UnreadableError(path, "a folder") from None
     except OSError as error:
@@ -54,21 +57,26 @@ def parse(text: str, file: Path) -> Scenario:
     try:
         data = tomllib.loads(text)
     except RecursionError:
-        raise ScenarioError(file, "file", "lists nested too deeply", "valid TOML") from None
+        raise ScenarioError(file, "file", InWords("lists nested too deeply"), "valid TOML") from None
     except ValueError as error:  # a TOMLDecodeError, or a number of thousands of digits
-        raise ScenarioError(file, "file", str(error), "valid TOML") from None
+        raise ScenarioError(file, "file", InWords(error), "valid TOML") from None
     try:
         # Strict validation accepts lists as tuples only from JSON text, in which a TOML date is a string.
         scenario = Scenario.model_validate_json(to_json(data))
     except ValidationError as errors:
         raise _at_line(file, text, data, *_first_error(errors, data)) from None
     if scenario.code:
-        raise _at_line(file, text, data, "code", "tables", "no such key: files of code are named by other keys")
+        raise _at_line(
+            file, text, data, "code", InWords("tables"), "no such key: files of code are named by other keys"
+        )
     for key, read, wanted in _contradictions(scenario):
         raise _at_line(file, text, data, key, read, wanted)
-    if scenario.links.profile is not None:
-        scenario = with_profile(scenario, scenario.links.profile, file)
-    return with_code(with_traces(scenario, file), file)
+    try:
+        if scenario.links.profile is not None:
+            scenario = with_profile(scenario, scenario.links.profile, file)
+        return with_code(with_traces(scenario, file), file)
+    except ScenarioError as error:
+        raise _at_line(file, text, data, error.place, error.read, error.wanted) from None
 
 
 def with_profile(scenario: Scenario, name: str, file: Path, key: str = "links.profile") -> Scenario:
@@ -77,7 +85,7 @@ def with_profile(scenario: Scenario, name: str, file: Path, key: str = "links.pr
     links = Links(up=profile.up, down=profile.down, channels=profile.channels, times_from=scenario.links.times_from)
     changed = scenario.model_copy(update={"links": links})
     for place, read, wanted in _links_contradictions(changed):
-        raise ScenarioError(file, key, f"{name}: {place}: {read}", wanted)
+        raise ScenarioError(file, key, InWords(f"{name!r} with {place} {read!r}"), wanted)
     return changed
 
 
@@ -97,6 +105,13 @@ def checked(scenario: Scenario, file: Path) -> Scenario:
     return scenario
 
 
+def with_line(fault: str, file: Path) -> str:
+    """A fault "KEY: read …" of the scenario in a file that has been read, with the line of the key in front of it."""
+    key, read, rest = fault.partition(": read ")
+    text = file.read_text(encoding="utf-8")
+    return f"{place_of(key, text, tomllib.loads(text))}{read}{rest}"
+
+
 def dump(scenario: Scenario) -> str:
     """The scenario as TOML text that `parse` reads back to an equal object, beside `scenarios.own_code.write_code`."""
     import tomlkit
@@ -112,10 +127,7 @@ def fingerprint(scenario: Scenario) -> str:
 
 def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
     """The error, with the line in the file and the system id in place of a vehicle's index."""
-    line, key = line_of(text, location_of(key.split(" (", maxsplit=1)[0])), named(key, data)
-    if line is not None:
-        key = f"{key[:-1]}, line {line})" if key.endswith(")") else f"{key} (line {line})"
-    return ScenarioError(file, key, read, wanted)
+    return ScenarioError(file, place_of(key, text, data), read, wanted)
 
 
 def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, object, str]:
@@ -124,13 +136,16 @@ def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, ob
     first = min(errors.errors(), key=lambda error: error["type"] != "extra_forbidden")
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
     if first["type"] == "extra_forbidden":
-        name = str(first["loc"][-1])
         known = sorted(_model_at(first["loc"][:-1]).model_fields)
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        wanted = f"the key {near[0]}" if near else f"one of the keys {', '.join(known)}"
-        return f"{key} (unknown key)", first["input"], wanted
+        near = did_you_mean(str(first["loc"][-1]), known)
+        return key, InWords("an unknown key"), f"a known one{near}" if near else f"one of {', '.join(known)}"
+    if first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        part = first["loc"][:-1]
+        count = 1 + max(int(own["loc"][-1]) for own in errors.errors() if own["loc"][:-1] == part)
+        read = _value_at(data, part)
+        return key.rpartition("[")[0], read, f"a list of {count}, not {len(read)}"
     if first["type"] == "missing":
-        return f"{key} (missing)", "nothing", "a value for this key"
+        return key, None, "a value for this key"
     return key, _value_at(data, first["loc"]), wanted_of(first)
 
 
@@ -150,7 +165,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(argument)
 
 
-def _value_at(data: Any, location: tuple[int | str, ...]) -> object:
+def _value_at(data: Any, location: tuple[int | str, ...]) -> Any:
     for part in location:
         try:
             data = data[part]
@@ -188,7 +203,11 @@ def _control_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if control.gains is not None and required:
         yield "control.gains", control.gains.model_dump(), f"either gains or a requirement ({wanted})"
     if control.blocks and (required or control.gains is not None):
-        yield "control.blocks", f"{len(control.blocks)} blocks", f"either blocks, or gains, or a requirement ({wanted})"
+        yield (
+            "control.blocks",
+            InWords(f"{len(control.blocks)} blocks"),
+            f"either blocks, or gains, or a requirement ({wanted})",
+        )
     if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
         wanted = "inclusion without blocks, with dynamics autopilot: margins with a lag are computed only for its gains"
         yield "control.method", control.method, wanted
@@ -273,11 +292,14 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[Fault]:
     try:
         TopologicalSorter({v.system_id: [] if v.follows is None else [v.follows] for v in vehicles}).prepare()
     except CycleError as error:
-        cycle = " follows ".join(str(system_id) for system_id in reversed(error.args[1]))
+        cycle: list[int] = error.args[1][::-1]
         wanted = "a tree: every vehicle follows the leader, directly or through others"
-        yield "vehicles.follows", f"a cycle: {cycle}", wanted
+        read = InWords(f"a cycle: {' follows '.join(map(str, cycle))}")
+        yield f"vehicles[{system_ids.index(cycle[0])}].follows", read, wanted
     if len(leaders) != 1:
-        yield "vehicles.follows", f"vehicles without it: {leaders}", "exactly one vehicle without it, the leader"
+        key = f"vehicles[{system_ids.index(leaders[-1])}].follows" if leaders else "vehicles.follows"
+        read = InWords(f"vehicles without it: {leaders}")
+        yield key, read, "exactly one vehicle without it, the leader"
 
 
 def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
@@ -306,17 +328,17 @@ def _sector_contradictions(scenario: Scenario) -> Iterator[Fault]:
         return
     key, count = "disturbance.sector", 2 * len(scenario.vehicles) - 1
     if scenario.dynamics != "double_integrator":
-        yield key, f"dynamics {scenario.dynamics}", "no such key, unless dynamics is double_integrator"
+        yield key, InWords(f"dynamics {scenario.dynamics}"), "no such key, unless dynamics is double_integrator"
     if len(scenario.nominal_velocity) != 1 or scenario.manoeuvres:
         wanted = "no such key, unless one nominal velocity and one shape are flown"
-        yield key, "velocities or offsets that change", wanted
+        yield key, InWords("velocities or offsets that change"), wanted
     square = len(sector.direction) == count and all(len(row) == count for row in sector.direction)
     if not square or not any(any(row) for row in sector.direction):
         read = f"{len(sector.direction)} rows of {sorted({len(row) for row in sector.direction})} numbers"
-        yield f"{key}.direction", read, f"{count} rows of {count} numbers, not all zero"
+        yield f"{key}.direction", InWords(read), f"{count} rows of {count} numbers, not all zero"
     for name, found in (("all_pass_in", sector.all_pass_in), ("all_pass_out", sector.all_pass_out)):
         if len(found) not in (0, count):
-            yield f"{key}.{name}", f"{len(found)} numbers", f"{count} numbers, or none"
+            yield f"{key}.{name}", InWords(f"{len(found)} numbers"), f"{count} numbers, or none"
 
 
 def _velocity_contradictions(scenario: Scenario) -> Iterator[Fault]:
@@ -351,7 +373,7 @@ def _links_contradictions(scenario: Scenario) -> Iterator[Fault]:
     for k, channel in enumerate(links.channels):
         if (channel.queue_bytes is None) == (channel.queue_datagrams is None):
             read = "neither" if channel.queue_bytes is None else "both"
-            yield f"links.channels[{k}]", read, "either queue_bytes or queue_datagrams"
+            yield f"links.channels[{k}]", InWords(read), "either queue_bytes or queue_datagrams"
     for key, link in each_link(links):
         if link.channel is not None and link.channel not in names:
             yield f"{key}.channel", link.channel, f"the name of one of links.channels: {', '.join(names) or 'none'}"

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 from pydantic_core import to_json
 
-from scenarios.errors import ScenarioError
+from scenarios.errors import InWords, ScenarioError, did_you_mean
 from scenarios.keys.link import TRACE_DELAYS, Link, Links
 from scenarios.keys.part import MOST
 from scenarios.keys.profile import LinkProfile
@@ -31,14 +31,16 @@ def load_profile(name: str, beside: Path, key: str) -> LinkProfile:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         return LinkProfile.model_validate_json(to_json(data))
+    except FileNotFoundError:
+        raise ScenarioError(beside, key, name, wanted + did_you_mean(name, shipped)) from None
     except OSError as error:
-        raise ScenarioError(beside, key, f"{name}: {error.strerror}", wanted) from None
+        raise ScenarioError(beside, key, InWords(f"{name!r}: {error.strerror}"), wanted) from None
     except ValidationError as errors:
         first = errors.errors()[0]
         at = ".".join(str(part) for part in first["loc"])
-        raise ScenarioError(beside, key, f"{name}: {at}: {first['msg']}", wanted) from None
+        raise ScenarioError(beside, key, InWords(f"{name!r}: {at}: {first['msg']}"), wanted) from None
     except (ValueError, RecursionError) as error:
-        raise ScenarioError(beside, key, f"{name}: {error}", wanted) from None
+        raise ScenarioError(beside, key, InWords(f"{name!r}: {error}"), wanted) from None
 
 
 def dump_profile(profile: LinkProfile) -> str:
@@ -78,7 +80,9 @@ def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
     try:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(file, key, str(error), "a readable file with a delay in s on each line, or CSV") from None
+        raise ScenarioError(
+            file, key, InWords(error), "a readable file with a delay in s on each line, or CSV"
+        ) from None
     cells = [cell.strip() for cell in rows[0]] if rows else []
     first = int(TRACE_COLUMN in cells)
     column = cells.index(TRACE_COLUMN) if first else 0
@@ -92,8 +96,8 @@ def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
                 delay_s = float(row[column])
         if not 0 <= delay_s <= MOST:
             wanted = f"a delay from 0 to {MOST:g} s on each line, or CSV with a column {TRACE_COLUMN}"
-            raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)
+            raise ScenarioError(file, key, InWords(f"{','.join(row)!r} in line {number} of {path.name}"), wanted)
         delays.append(delay_s)
     if not 1 <= len(delays) <= TRACE_DELAYS:
-        raise ScenarioError(file, key, f"{path.name}: {len(delays)} delays", f"1 to {TRACE_DELAYS}")
+        raise ScenarioError(file, key, InWords(f"{len(delays)} delays in {path.name}"), f"1 to {TRACE_DELAYS}")
     return tuple(delays)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
+from scenarios.errors import InWords
 from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
 from scenarios.smooth import TooShortError
@@ -32,7 +33,11 @@ def _waypoint_contradictions(scenario: Scenario) -> Iterator[Fault]:
             yield "course.speed_m_s", course.speed_m_s, "no such key without course.waypoints_ne_m"
         return
     if scenario.nominal_velocity:
-        yield "nominal_velocity", f"{len(scenario.nominal_velocity)} entries", "none with course.waypoints_ne_m"
+        yield (
+            "nominal_velocity",
+            InWords(f"{len(scenario.nominal_velocity)} entries"),
+            "none with course.waypoints_ne_m",
+        )
     if len(points) < 2 or any(a == b for a, b in pairwise(points)):
         yield (
             "course.waypoints_ne_m",
@@ -42,7 +47,7 @@ def _waypoint_contradictions(scenario: Scenario) -> Iterator[Fault]:
     lowest, highest = limits.speed_min_m_s, limits.speed_max_m_s or math.inf
     for key, value in (("speed_m_s", course.speed_m_s), ("acceleration_max_m_s2", course.acceleration_max_m_s2)):
         if value is None:
-            yield f"course.{key} (missing)", "nothing", "a value for this key, with course.waypoints_ne_m"
+            yield f"course.{key}", None, "a value for this key, with course.waypoints_ne_m"
     if course.speed_m_s is not None and not lowest <= course.speed_m_s <= highest:
         wanted = f"a speed within the limits, {lowest:g} to {highest:g} m/s"
         yield "course.speed_m_s", course.speed_m_s, wanted
@@ -63,7 +68,7 @@ def _course_contradictions(scenario: Scenario) -> Iterator[Fault]:
         changes = scenario.smooth_course().changes
     except TooShortError as error:
         wanted = "longer legs, a lower course.speed_m_s, or larger bounds on acceleration and jerk"
-        yield "course.waypoints_ne_m", str(error), wanted
+        yield "course.waypoints_ne_m", InWords(error), wanted
         return
     for k, (before, after) in enumerate(pairwise(changes), start=2):
         if not course.waypoints_ne_m and after.from_s < before.until_s:
@@ -99,7 +104,7 @@ def _change_contradictions(scenario: Scenario) -> Iterator[Fault]:
     for k, change in enumerate(scenario.formation_changes):
         key = f"formation_changes[{k}]"
         if scenario.control.loop == "onboard":
-            yield key, "a change", "none with loop onboard: vehicles hold the offsets that were uploaded"
+            yield key, InWords("a change"), "none with loop onboard: vehicles hold the offsets that were uploaded"
         if change.at_s < free_s:
             yield f"{key}.at_s", change.at_s, f"at least {free_s:g}, when the change before is over"
         free_s = change.at_s + change.duration_s

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from scenarios.errors import ScenarioError
+from scenarios.errors import InWords, ScenarioError
 from scenarios.keys.own import BUILT_IN, CodeFile, names_code
 from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
@@ -41,17 +41,17 @@ def own_code_faults(scenario: Scenario) -> Iterator[Fault]:
     own_dynamics = scenario.dynamics not in BUILT_IN
     if own_law != (control.controller is not None):
         wanted = "FILE.py:NAME, with method python" if own_law else "no such key, unless method is python"
-        yield "control.controller", control.controller or "nothing", wanted
+        yield "control.controller", control.controller, wanted
     if control.linear is not None and not own_law:
         yield "control.linear", control.linear, "no such key, unless method is python"
     if own_law:
         for name in ("gains", "blocks", "delay_margin_s", "alpha", "decay_rate_1_s", "criteria", "overlap"):
             if getattr(control, name):
-                yield f"control.{name}", name, "no such key with method python, which designs nothing"
+                yield f"control.{name}", InWords(name), "no such key with method python, which designs nothing"
         if control.prediction != "off":
             yield "control.prediction", control.prediction, "off, with method python"
         if any(vehicle.hears for vehicle in scenario.vehicles):
-            yield "vehicles.hears", "system ids", "no such key with method python: the law knows every vehicle"
+            yield "vehicles.hears", InWords("system ids"), "no such key with method python: the law knows every vehicle"
     if control.loop == "onboard" and (own_law or own_dynamics):
         key = "method python" if own_law else f"dynamics {scenario.dynamics}"
         yield "control.loop", control.loop, f"ground, with {key}"
@@ -75,11 +75,11 @@ def _read(name: str, file: Path, key: str) -> str:
     wanted = f"a readable Python file of at most {LARGEST_BYTES} bytes"
     try:
         if path.stat().st_size > LARGEST_BYTES:
-            raise ScenarioError(file, key, f"{name}: {path.stat().st_size} bytes", wanted)
+            raise ScenarioError(file, key, InWords(f"{name!r}: {path.stat().st_size} bytes"), wanted)
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         read = error.strerror if isinstance(error, OSError) else "bytes that are not UTF-8"
-        raise ScenarioError(file, key, f"{name}: {read}", wanted) from None
+        raise ScenarioError(file, key, InWords(f"{name!r}: {read}"), wanted) from None
 
 
 def as_flown(scenario: Scenario) -> Scenario:
@@ -133,7 +133,7 @@ def function_of(scenario: Scenario, key: str) -> Any:
         if isinstance(error, KeyboardInterrupt):
             raise
         read = f"{type(error).__name__}: {error}"
-        raise ScenarioError(Path(path), key, read, "a file that runs without an exception") from error
+        raise ScenarioError(Path(path), key, InWords(read), "a file that runs without an exception") from error
     if not callable(found := getattr(module, wanted, None)):
         raise ScenarioError(Path(path), key, wanted, "the name of a function in this file")
     return found

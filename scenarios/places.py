@@ -1,5 +1,6 @@
 """For errors in a scenario file: the line of a key, and what its value must be, in plain words."""
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Mapping
@@ -8,6 +9,7 @@ from typing import Any
 Location = tuple[int | str, ...]
 _HEADER = re.compile(r"\s*(\[\[?)\s*([\w.\s-]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([\w-]+(?:\s*\.\s*[\w-]+)*)\s*=")
+_OF_VEHICLE = re.compile(r"vehicle (\d+): (.*)")
 _PART = re.compile(r"([\w-]+)|\[(\d+)\]")
 
 
@@ -16,11 +18,28 @@ def location_of(key: str) -> Location:
     return tuple(name or int(number) for name, number in _PART.findall(key))
 
 
+def place_of(key: str, text: str, data: Mapping[str, Any]) -> str:
+    """The line of a key in a TOML text, if it has one, and its name: "line 9: vehicle 2: follows".
+
+    The key is one such as "vehicles[1].follows", or names the vehicle already.
+    """
+    if of_vehicle := _OF_VEHICLE.fullmatch(key):
+        ids = [vehicle["system_id"] for vehicle in data["vehicles"]]
+        key = f"vehicles[{ids.index(int(of_vehicle[1]))}].{of_vehicle[2]}"
+    line = line_of(text, location_of(key))
+    return named(key, data) if line is None else f"line {line}: {named(key, data)}"
+
+
 def line_of(text: str, location: Location) -> int | None:
-    """The line of a TOML text, from 1, of a location, or of the part around it if it has no line of its own."""
+    """The line of a TOML text, from 1, of a location.
+
+    Where it has no line of its own, that of the first part of it, or else of the part around it.
+    """
     lines: dict[Location, int] = {}
     tables: Counter[Location] = Counter()
     table: Location = ()
+    key: Location = ()
+    entries = 0
     for number, line in enumerate(text.splitlines(), 1):
         if header := _HEADER.match(line):
             table = ()
@@ -34,9 +53,24 @@ def line_of(text: str, location: Location) -> int | None:
                 tables[table] += 1
                 table = (*table, tables[table] - 1)
             lines.setdefault(table, number)
-        elif found := _KEY.match(line):
-            lines.setdefault((*table, *re.split(r"\s*\.\s*", found[1])), number)
-    return next((lines[location[:k]] for k in range(len(location), 0, -1) if location[:k] in lines), None)
+            continue
+        if found := _KEY.match(line):
+            key, entries = (*table, *re.split(r"\s*\.\s*", found[1])), 0
+            lines.setdefault(key, number)
+        if found or line.lstrip().startswith("{"):  # a list of tables may have each on a line of its own
+            for _ in range(_outer_tables(line)):
+                lines.setdefault((*key, entries), number)
+                entries += 1
+    for k in range(len(location), 0, -1):
+        if found := [line for at, line in lines.items() if at[:k] == location[:k]]:
+            return lines.get(location[:k], min(found))
+    return None
+
+
+def _outer_tables(line: str) -> int:
+    """How many inline tables a line begins that are in no other."""
+    depths = itertools.accumulate((char == "{") - (char == "}") for char in line)
+    return sum(char == "{" and depth == 1 for char, depth in zip(line, depths, strict=True))
 
 
 def named(key: str, data: Mapping[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from scenarios.errors import InWords
 from scenarios.keys.criteria import Criteria
 from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
@@ -32,13 +33,13 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if criteria is None:
         return
     if given:
-        yield "control.criteria", "requirements", "either criteria, or gains or blocks"
+        yield "control.criteria", InWords("requirements"), "either criteria, or gains or blocks"
     if control.loop == "onboard":
         yield "control.loop", control.loop, "ground, with control.criteria"
     if scenario.dynamics != "double_integrator":
         yield from _late_contradictions(scenario, criteria)
     if control.prediction != "off":
-        yield "control.criteria", "requirements", "no such key with prediction"
+        yield "control.criteria", InWords("requirements"), "no such key with prediction"
     low, high = criteria.delays_s or (0.0, 0.0)
     if low > high:
         yield "control.criteria.delays_s", [low, high], "the smaller delay first"
@@ -57,7 +58,7 @@ def _late_contradictions(scenario: Scenario, criteria: Criteria) -> Iterator[Fau
     """Criteria of vehicles that do not respond at once."""
     whose, wanted = f"with dynamics {scenario.dynamics}", "it is for vehicles that respond at once"
     if scenario.control.for_link == "off":
-        yield "control.criteria", "requirements", f"no such key {whose} and without for_link: {wanted}"
+        yield "control.criteria", InWords("requirements"), f"no such key {whose} and without for_link: {wanted}"
     for name in _WITHOUT_DELAY:
         if value := getattr(criteria, name):
             yield f"control.criteria.{name}", value, f"no such key {whose}: {wanted}"

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from scenarios.errors import InWords
 from scenarios.keys.part import MOST, Fault, NotNegative, Part, Positive, Probability, SystemId
 
 TRACE_DELAYS = 100_000
@@ -69,17 +70,19 @@ class Jitter(Part):
 
     def contradictions(self, key: str) -> Iterator[Fault]:
         """What contradicts itself in these keys; `key` is where they stand in the file."""
-        given = [name for name in ("scale_s", "shape", "trace_file", "trace_s") if getattr(self, name) is not None]
-        if self.distribution == "trace":
-            if given not in (["trace_file"], ["trace_s"]):
-                yield key, ", ".join(given) or "neither", "either trace_file or trace_s with distribution trace"
-            if self.trace_s is not None and not 1 <= len(self.trace_s) <= TRACE_DELAYS:
-                yield f"{key}.trace_s", f"{len(self.trace_s)} delays", f"1 to {TRACE_DELAYS}"
-            return
-        wanted = ["scale_s", "shape"] if self.distribution == "gamma" else ["scale_s"]
-        if given != wanted:
-            text = f"{' and '.join(wanted)} and nothing else with distribution {self.distribution}"
-            yield key, ", ".join(given) or "nothing", text
+        which, traces = f"with distribution {self.distribution}", (self.trace_file, self.trace_s)
+        needed = {"gamma": ("scale_s", "shape"), "trace": ()}.get(self.distribution, ("scale_s",))
+        possible = ("trace_file", "trace_s") if self.distribution == "trace" else needed
+        for name in ("scale_s", "shape", "trace_file", "trace_s"):
+            value = getattr(self, name)
+            if value is None and name in needed:
+                yield f"{key}.{name}", None, f"a number, {which}"
+            if value is not None and name not in possible:
+                yield f"{key}.{name}", value, f"no such key {which}"
+        if self.distribution == "trace" and traces.count(None) != 1:
+            yield key, InWords("both" if all(traces) else "neither"), f"either trace_file or trace_s {which}"
+        if self.trace_s is not None and not 1 <= len(self.trace_s) <= TRACE_DELAYS:
+            yield f"{key}.trace_s", InWords(f"{len(self.trace_s)} delays"), f"1 to {TRACE_DELAYS}"
 
 
 class LossBursts(Part):

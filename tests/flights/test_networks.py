@@ -113,7 +113,7 @@ def test_the_benchmarks_formation_fills_one_network_after_the_other() -> None:
             "replay flight-1.tlog networks.toml",
             "networks.toml: read vehicles in the networks 0 1 9, wanted network 0",
         ),
-        ("fly wrong.toml", "vehicle 1251: system_id (line 17): read 1251, wanted at most 250, or 1001 to 1250 in"),
+        ("fly wrong.toml", "line 17: vehicle 1251: system_id: read 1251, wanted at most 250, or 1001 to 1250 in"),
     ],
 )
 def test_what_networks_cannot_do_is_one_line(

@@ -43,7 +43,7 @@ def test_waypoints_are_rounded_and_the_last_is_met() -> None:
 
 
 REFUSED = {
-    "no speed": ("speed_m_s = 25.0\n", "", "course.speed_m_s (missing", "with course.waypoints_ne_m"),
+    "no speed": ("speed_m_s = 25.0\n", "", "course.speed_m_s: read nothing", "with course.waypoints_ne_m"),
     "short legs": ("acceleration_max_m_s2 = 4.0", "acceleration_max_m_s2 = 0.4", "waypoints", "longer legs"),
     "turning back": ("[850, 450], [850, 1000]", "[0, 0]", "course.waypoints_ne_m", "longer legs"),
     "one place": ("[400, 0], [850, 450], [850, 1000]]", "]", "course.waypoints_ne_m", "two places"),
@@ -73,12 +73,12 @@ def test_overlapping_changes_of_velocity_or_formation_are_refused() -> None:
         f"[[nominal_velocity]]\nfrom_s = {from_s}\nvelocity_ne_m_s = {velocity}\n\n"
         for from_s, velocity in ((5, [0.0, 91.44]), (9, [91.44, 0.0]))
     )
-    with pytest.raises(ScenarioError, match=r"nominal_velocity\[2\].from_s .* when the change before is over"):
+    with pytest.raises(ScenarioError, match=r"nominal_velocity\[2\].from_s: .* when the change before is over"):
         parse(smooth.replace("[[vehicles]]", f"{turns}[[vehicles]]", 1), Path("c.toml"))
     change = (
         "[[formation_changes]]\nat_s = {}\nduration_s = 5.0\noffsets = [{{ system_id = 2, offset_ne_m = [-9, 9] }}]\n"
     )
-    with pytest.raises(ScenarioError, match=r"formation_changes\[1\].at_s .* at least 7"):
+    with pytest.raises(ScenarioError, match=r"formation_changes\[1\].at_s: .* at least 7"):
         parse(chain + change.format(2.0) + change.format(6.9), Path("c.toml"))
 
 
