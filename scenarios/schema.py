@@ -132,9 +132,9 @@ class Control(Part):
     errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
     `string_peak_max` holds at every delay, and `delay_margin_s` limits the vehicles' own gains as if the station closed
     their loop."""
-    delay_margin_s: Positive | None = None
+    delay_margin_s: Annotated[float, Field(gt=0, le=30)] | None = None
     """Requirement: least delay margin of the sampled loop."""
-    alpha: Annotated[float, Field(gt=0, lt=1)] | None = None
+    alpha: Annotated[float, Field(ge=5e-4, lt=1)] | None = None
     """Requirement: least robustness bound (thesis eq. 3.29)."""
     decay_rate_1_s: Positive | None = None
     """Requirement: least decay rate of the continuous loop without delay."""

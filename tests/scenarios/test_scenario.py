@@ -4,10 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
+from gains.core.requirement import ALPHA_MIN, DELAY_MARGIN_MAX_S, Requirement
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, fingerprint, load, parse
-from scenarios.schema import Scenario
+from scenarios.schema import Control, Scenario
+from scenarios.shipped import columns
 from tests.support.paths import SCENARIOS
 
 TRIANGLE = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
@@ -84,7 +87,7 @@ BAD = {
     "number as text": ("control_hz = 50.0", 'control_hz = "50"', "rates.control_hz", "number"),
     "date": ("duration_s = 40.0", "duration_s = 2026-01-01", "duration_s", "number"),
     "missing key": ("seed = 1\n", "", "seed", "a value"),
-    "short pair": ("[91.44, 0.0]", "[91.44]", "nominal_velocity[0].velocity_ne_m_s[1]", "a value"),
+    "short pair": ("[91.44, 0.0]", "[91.44]", "nominal_velocity[0].velocity_ne_m_s", "a list of 2, not 1"),
     "not a number": ("[91.44, 0.0]", "[nan, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "finite"),
     "infinite": ("duration_s = 40.0", "duration_s = inf", "duration_s", "finite"),
     "beyond single precision": ("altitude_m = 1000.0", "altitude_m = 1e300", "altitude_m", "1000000"),
@@ -94,11 +97,11 @@ BAD = {
     "negative delay": ("up = { delay_s = 0.02 }", "up = { delay_s = -0.02 }", "links.up.delay_s", "at least 0"),
     "zero rate": ("telemetry_hz = 50.0", "telemetry_hz = 0.0", "rates.telemetry_hz", "at least 1"),
     "unknown leader": ("follows = 1", "follows = 9", "vehicle 2: follows", "system_id of a vehicle"),
-    "itself": ("follows = 1", "follows = 2", "vehicles.follows", "tree"),
-    "cycle": ("follows = 1", "follows = 3", "vehicles.follows", "tree"),
+    "itself": ("follows = 1", "follows = 2", "vehicle 2: follows", "tree"),
+    "cycle": ("follows = 1", "follows = 3", "vehicle 2: follows", "tree"),
     "two with one id": ("system_id = 3", "system_id = 2", "vehicle in place 3: system_id", "a different number"),
     "id of a station": ("system_id = 3", "system_id = 255", "vehicle 255: system_id", "at most 250"),
-    "two leaders": ("follows = 1\noffset_ne_m = [-121.92, 121.92]\n", "", "vehicles.follows", "exactly one"),
+    "two leaders": ("follows = 1\noffset_ne_m = [-121.92, 121.92]\n", "", "vehicle 2: follows", "exactly one"),
     "offset without leader": ("follows = 1\n", "", "vehicle 2: offset_ne_m", "neither"),
     "no distance": ("[-121.92, 121.92]", "[0.0, 0.0]", "vehicle 2: offset_ne_m", "other than zero"),
     "late first velocity": ("from_s = 0.0", "from_s = 1.0", "nominal_velocity[0].from_s", "0 for the first"),
@@ -137,7 +140,7 @@ def test_a_bad_scenario_names_file_key_and_what_was_wanted(old: str, new: str, k
     line = str(error.value)
     place, _, rest = line.partition(": read ")
     assert "\n" not in line
-    assert place.startswith(f"x.toml: {key}")
+    assert re.sub(r"line \d+: ", "", place).startswith(f"x.toml: {key}")
     assert wanted in rest.partition("wanted ")[2]
 
 
@@ -163,14 +166,14 @@ def test_errors_say_what_was_wanted_with_the_line(old: str, new: str, wanted: st
     told = str(error.value)
     assert wanted in told
     number = next(k for k, line in enumerate(changed.splitlines(), 1) if new in line)
-    assert f"line {number})" in told
+    assert told.startswith(f"x.toml: line {number}: ")
 
 
 def test_errors_name_the_system_id_and_the_line() -> None:
     lines = TRIANGLE.splitlines()
     at = [k for k, line in enumerate(lines) if line.startswith("system_id")][4]
     lines.insert(at + 1, "colour = 1")
-    with pytest.raises(ScenarioError, match=rf"x\.toml: vehicle 5: colour \(unknown key, line {at + 2}\): read 1"):
+    with pytest.raises(ScenarioError, match=rf"x\.toml: line {at + 2}: vehicle 5: colour: read an unknown key"):
         parse("\n".join(lines), FILE)
 
 
@@ -183,10 +186,85 @@ def test_every_error_that_the_schema_can_raise_has_words() -> None:
 
 
 def test_links_of_an_unknown_vehicle_are_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"links of vehicle 9: system_id \(line \d+\): read 9"):
+    with pytest.raises(ScenarioError, match=r"line \d+: links of vehicle 9: system_id: read 9"):
         parse(TRIANGLE + "\n[[links.vehicles]]\nsystem_id = 9\n", FILE)
 
 
 def test_missing_file_is_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"nowhere\.toml: read nothing: No such file"):
+    with pytest.raises(ScenarioError, match=r"nowhere\.toml: read no such file, wanted a scenario file or the name of"):
         load(Path("nowhere.toml"))
+
+
+JITTER = "up = { delay_s = 0.02, jitter = "
+WORDS = {
+    "no offset": ("offset_ne_m = [-121.92, 121.92]\n", "", "vehicle 2: offset_ne_m: read nothing, wanted both follows"),
+    "no seed": ("seed = 1\n", "", "x.toml: seed: read nothing, wanted a value for this key"),
+    "half a pair": ("[-121.92, 121.92]", "[-25.0]", "offset_ne_m: read [-25.0], wanted a list of 2, not 1"),
+    "no pair": ("[-121.92, 121.92]", "[]", "offset_ne_m: read [], wanted a list of 2, not 0"),
+    "a key too many": (
+        "up = { delay_s = 0.02",
+        JITTER + '{ distribution = "normal", scale_s = 1.0, shape = 2.0 }',
+        "links.up.jitter.shape: read 2.0, wanted no such key with distribution normal",
+    ),
+    "a key too few": (
+        "up = { delay_s = 0.02",
+        JITTER + '{ distribution = "gamma", shape = 2.0 }',
+        "links.up.jitter.scale_s: read nothing, wanted a number, with distribution gamma",
+    ),
+    "no trace": (
+        "up = { delay_s = 0.02",
+        JITTER + '{ distribution = "trace" }',
+        "links.up.jitter: read neither, wanted either trace_file or trace_s with distribution trace",
+    ),
+    "a misspelt section": ("[links]", "[link]", "link: read an unknown key, wanted a known one; did you mean links?"),
+    "a key like none": ("seed = 1", "zzz = 1", "zzz: read an unknown key, wanted one of altitude_m, at_end"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "told"), WORDS.values(), ids=WORDS)
+def test_errors_say_in_words_what_was_read(old: str, new: str, told: str) -> None:
+    assert old in TRIANGLE
+    with pytest.raises(ScenarioError) as error:
+        parse(TRIANGLE.replace(old, new, 1), FILE)
+    assert told in str(error.value)
+
+
+@pytest.mark.parametrize(("name", "meant"), [("triangel5", "; did you mean triangle5?"), ("nowhere", "scenarios)")])
+def test_a_close_name_of_a_shipped_scenario_is_offered(name: str, meant: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        load(Path(name))
+    assert str(error.value).endswith(meant)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("delay_s = 0.02 }    # tel", "delay_s = -1 }    # tel", 22),
+        ("{ system_id = 3,", "{ system_id = 300,", 15),
+        ("[-79, 83]", "[-79]", 15),
+        ("follows = 1,", "follows = 3,", 14),
+        ("[25.0, 0.0] }]", "[25.0] }]", 9),
+        ("delay_margin_s = 0.3", "delay_margin_s = 31", 19),
+        ("delay_margin_s = 0.3", "alpha = 4e-4", 19),
+        ("up = { delay_s = 0.02 }", 'profile = "lte"', 22),
+        ("[control]\ndelay_margin_s = 0.3", "control = { delay_margin_s = 300 }", 18),
+    ],
+)
+def test_mistakes_in_a_new_scenario_are_located(old: str, new: str, line: int) -> None:
+    text = columns("mine", 1, 3)
+    assert old in text
+    text = text.replace(old, new, 1)
+    if "control = {" in new:  # a key of the whole file stands before its tables
+        text = "\n".join([new, *text.replace(new, "").splitlines()])
+        line = 1
+    with pytest.raises(ScenarioError, match=rf"^x\.toml: line {line}: "):
+        parse(text, FILE)
+
+
+def test_bounds_of_requirements_are_those_of_designs() -> None:
+    most_s, least = DELAY_MARGIN_MAX_S, ALPHA_MIN
+    assert Control(delay_margin_s=most_s).delay_margin_s == Requirement(delay_margin_s=most_s).delay_margin_s
+    assert Control(alpha=least).alpha == Requirement(alpha=least).alpha
+    for past in ({"delay_margin_s": 1.001 * most_s}, {"alpha": 0.999 * least}):
+        with pytest.raises(ValidationError):
+            Control.model_validate(past)
