@@ -79,15 +79,15 @@ def fly(
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
-    _refuse_unusable(assert_headroom, assert_settled, junit)
+    _refuse_unusable(link_delay, assert_headroom, assert_settled, junit)
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
     _refuse_contradictions(sockets, speed, live, virtual=virtual, mirror_commands=mirror_commands)
     scenario = options.load_scenario(scenario_file, loop, without, links=links, allow_code=allow_code)
     if link_delay is not None:
-        options.within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     if connect is None:
-        options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
+        options.refuse(scenario_file, preflight.bad_start(scenario))
+        options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
     with contextlib.ExitStack() as opened:
         link = to = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
@@ -144,7 +144,11 @@ def fly(
     raise typer.Exit(INTERRUPTED if summary.reason.startswith("interrupted") else 0 if passed else FAILED)
 
 
-def _refuse_unusable(least_headroom: float | None, settled_s: float | None, junit: Path | None) -> None:
+def _refuse_unusable(
+    link_delay_s: float | None, least_headroom: float | None, settled_s: float | None, junit: Path | None
+) -> None:
+    if link_delay_s is not None:
+        options.within("--link-delay", link_delay_s, 0, 60, "seconds")
     if least_headroom is not None:
         options.within("--assert-headroom", least_headroom, -1e3, 1.0)
     if settled_s is not None:

@@ -107,14 +107,11 @@ def load_scenario(
     from scenarios.own_code import refusal
     from scenarios.shipped import located
 
-    found = located(str(file))
-    if not found.exists():
-        raise InputError(f"{file}: read no such file, wanted a scenario file or the name of one (see gcs scenarios)")
-    scenario = load(found)
+    scenario = load(located(str(file)))
     if allow_code is not True and (refused := refusal(scenario, file, allow_code or "")):
         raise InputError(refused)
     if links is not None:
-        scenario = with_profile(scenario, links, Path("--links"), "profile")
+        scenario = with_profile(scenario, links, Path("--links"), "")
     scenario = scenario if loop is None else with_loop(scenario, loop, file)
     return without(scenario, left_out, file) if left_out else scenario
 
@@ -133,11 +130,17 @@ def say_if_first_flight() -> None:
         print("first flight on this machine: compiling what runs for every frame, half a minute", file=sys.stderr)
 
 
-def refuse(file: Path, *findings: str | None) -> None:
-    """Refuse a scenario for the first of these findings that is not None."""
+def refuse(file: Path, *findings: str | None, in_file: bool = True) -> None:
+    """Refuse a scenario for the first of these findings that is not None.
+
+    It is shown with its line in the file, unless an option replaced what is written there (not `in_file`).
+    """
+    from scenarios.files import with_line
+    from scenarios.shipped import located
+
     for finding in findings:
         if finding is not None:
-            raise InputError(f"{file}: {finding}")
+            raise InputError(f"{file}: {with_line(finding, located(str(file))) if in_file else finding}")
 
 
 def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:

@@ -133,7 +133,8 @@ def stress(
         options.print_json(reflown.outcome) if as_json else print_reflown(reflown)
         raise typer.Exit(FAILED if reflown.outcome.error is not None or reflown.differs else 0)
     axes = [parse_axis(option, text, study.plan.formation.system_ids) for option, text in given]
-    options.refuse(scenario_file, *(endless_link(one.scenario) for one in (study.sweep(axes, seeds=1) if axes else [])))
+    swept = study.sweep(axes, seeds=1) if axes else []
+    options.refuse(scenario_file, *(endless_link(one.scenario) for one in swept), in_file=False)
     # flights in real time disturb each other: one at a time unless the user knows better
     at_once = workers or (1 if real_time else len(os.sched_getaffinity(0)))
     if axes and not (as_json or dask):
@@ -198,10 +199,10 @@ def _study(
     options.say_if_first_flight()
     if (disturbance and scenario.dynamics != "double_integrator") or (real_time and scenario.dynamics == "autopilot"):
         option = "--disturbance" if disturbance else "--real-time"
-        raise InputError(f"{file}: dynamics: read {scenario.dynamics!r}, wanted double_integrator with {option}")
+        options.refuse(file, f"dynamics: read {scenario.dynamics!r}, wanted double_integrator with {option}")
     if scenario.control.prediction == "measured":
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
-        raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
+        options.refuse(file, f"control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
     options.refuse(file, bad_start(scenario))
     design, planned = flight_plan(scenario.with_calm_monitor())

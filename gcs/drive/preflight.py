@@ -89,7 +89,7 @@ def bad_start(scenario: Scenario) -> str | None:
         if apart_m < safety.collision_distance_m:
             read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
             wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
-            return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
+            return f"vehicle {two.system_id}: position_ne_m: read {read}, wanted {wanted}"
     speeds_m_s = [("nominal_velocity", hypot(*entry.velocity_ne_m_s)) for entry in scenario.nominal_velocity]
     for key, speed_m_s in (*speeds_m_s, ("course.speed_m_s", scenario.course.speed_m_s or 0.0)):
         if scenario.dynamics == "autopilot" and speed_m_s > scenario.autopilot.speed_max_m_s:
@@ -103,9 +103,9 @@ def bad_start(scenario: Scenario) -> str | None:
         wanted_ne_m = [a + o for a, o in zip(ahead, offset, strict=True)]
         error_m = dist(wanted_ne_m, vehicle.position_ne_m)
         if error_m > safety.spacing_error_limit_m:
-            read = f"vehicle {vehicle.system_id} with a spacing error of {error_m:g} m"
+            read = f"a spacing error of {error_m:g} m"
             wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"
-            return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
+            return f"vehicle {vehicle.system_id}: position_ne_m: read {read}, wanted {wanted}"
     return _close_places(scenario)
 
 
@@ -116,7 +116,7 @@ def _close_places(scenario: Scenario) -> str | None:
         return None
     one, two = nearest.system_ids
     read = f"places of vehicles {one} and {two} {nearest.distance_m:.2f} m apart at {nearest.time_s:.1f} s"
-    key = "formation_changes" if scenario.formation_changes else "vehicles.offset_ne_m"
+    key = "formation_changes" if scenario.formation_changes else f"vehicle {two}: offset_ne_m"
     return f"{key}: read {read}, wanted at least safety.collision_distance_m = {least_m:g} m"
 
 

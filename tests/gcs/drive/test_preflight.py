@@ -31,6 +31,13 @@ def chain_file(folder: Path, *changes: tuple[str, str]) -> Path:
     return file
 
 
+def line_of_vehicle(file: Path, system_id: int) -> int:
+    """The line of a vehicle's position."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    after = lines.index(f"system_id = {system_id}")
+    return next(k for k, text in enumerate(lines, 1) if k > after and text.startswith("position_ne_m"))
+
+
 def with_gains(folder: Path, K1: float, K2: float, K3: float) -> Path:
     return chain_file(folder, ("delay_margin_s = 0.3", f"gains = {{K1 = {K1!r}, K2 = {K2!r}, K3 = {K3!r}}}"))
 
@@ -71,7 +78,8 @@ def test_an_unstable_loop_is_refused_with_its_root(
 ) -> None:
     file = with_gains(tmp_path, *gains)
     line = complaint(capsys, monkeypatch, command[0], str(file), *command[1:])
-    assert line.startswith(f"{file}: control.gains: read a loop that ")
+    number = file.read_text(encoding="utf-8")[: file.read_text(encoding="utf-8").index("gains = ")].count("\n") + 1
+    assert line.startswith(f"{file}: line {number}: control.gains: read a loop that ")
     assert told in line
 
 
@@ -125,9 +133,12 @@ def test_starts_in_collision_or_past_the_limit_are_found_beforehand(
     for command in (("fly", "--virtual"), ("stress", "--onset"), ("bench",), ("compare",)):
         line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
+        assert line.startswith(f"{near}: line {line_of_vehicle(near, 3)}: vehicle 3: position_ne_m: ")
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
     far = chain_file(tmp_path, ("[-242.79, 243.09]", "[-2242.79, 243.09]"))
-    assert "read vehicle 3 with a spacing error of 1998" in complaint(capsys, monkeypatch, "fly", str(far), "--virtual")
+    assert "vehicle 3: position_ne_m: read a spacing error of 1998" in complaint(
+        capsys, monkeypatch, "fly", str(far), "--virtual"
+    )
 
 
 def test_a_link_too_slow_for_the_flight_is_found_beforehand(
@@ -146,6 +157,8 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     late = str(chain_file(tmp_path, ("delay_s = 0.02", "delay_s = 40.0")))
     for command in ("bench", "compare", "capacity"):
         assert "read a round trip of 80 s to vehicle 1" in complaint(capsys, monkeypatch, command, late)
+    number = Path(late).read_text(encoding="utf-8").splitlines().index("[links]") + 1
+    assert complaint(capsys, monkeypatch, "check", late).startswith(f"{late}: line {number}: links: read a round trip")
     assert endless_link(CHAIN.with_link_delay(up_s=9.9, down_s=9.9)) is None
     short = CHAIN.with_link_delay(up_s=3.0, down_s=3.0).model_copy(update={"duration_s": 6.0})
     assert "wanted less than duration_s = 6 s" in (endless_link(short) or "")
@@ -193,7 +206,7 @@ def test_places_nearer_than_a_collision_are_refused() -> None:
     ]
     safety = CHAIN.safety.model_copy(update={"collision_distance_m": wanted_m + 5.0, "spacing_error_limit_m": 1e4})
     fault = bad_start(CHAIN.model_copy(update={"vehicles": tuple(apart), "safety": safety})) or ""
-    assert fault.startswith("vehicles.offset_ne_m: read places of vehicles")
+    assert fault.startswith("vehicle 2: offset_ne_m: read places of vehicles 1 and 2")
     assert f"wanted at least safety.collision_distance_m = {wanted_m + 5.0:g} m" in fault
 
 
