@@ -18,6 +18,8 @@ from pydantic_core import to_jsonable_python
 from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
+from scenarios.errors import did_you_mean
+from scenarios.shipped import names
 
 if TYPE_CHECKING:  # it imports the schema of scenarios, which a JSON model does not need
     from gcs.plan.design import PredictionPart
@@ -52,6 +54,9 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
     try:
         text = _mat_as_json(file) if file.suffix == ".mat" else _json_of(file)
         return loop_margin(parse_model(text))
+    except FileNotFoundError:
+        wanted = "a model or a scenario (see gcs scenarios)"
+        raise ModelFileError(f"{file}: read no such file, wanted {wanted}{did_you_mean(file.stem, names())}") from None
     except OSError as error:
         raise ModelFileError(f"{file}: {error.strerror}; wanted a JSON model") from None
     except UnicodeDecodeError:

@@ -54,6 +54,7 @@ def new(
     Also writes scenario.schema.json beside it, with which editors complete and check the keys.
     """
     from scenarios import shipped
+    from scenarios.errors import did_you_mean
     from scenarios.files import parse
 
     if sum(asked is not None for asked in (like, chain, columns)) > 1:
@@ -64,12 +65,14 @@ def new(
         raise InputError(f"{file}: read a file that exists, wanted a new one")
     if like is not None:
         if like not in shipped.names():
-            raise InputError(f"--like: read {like}, wanted one of {', '.join(shipped.names())}")
+            near = did_you_mean(like, shipped.names())
+            raise InputError(f"--like: read {like}, wanted one of {', '.join(shipped.names())}{near}")
         text = shipped.copied(like, file.stem)
     else:
         text = shipped.columns(file.stem, *(_shape(columns) if columns is not None else (1, _chain(chain))))
     parse(text, file)
-    file.parent.mkdir(parents=True, exist_ok=True)
+    if not file.parent.is_dir():
+        raise InputError(f"{file}: read no folder {file.parent}, wanted one that exists")
     file.write_text(text, encoding="utf-8")
     beside = file.with_name(shipped.SCHEMA.name)  # the file names it: editors then know all keys
     if not beside.exists():

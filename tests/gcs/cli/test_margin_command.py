@@ -84,7 +84,7 @@ def test_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> None
     file = tmp_path / "model.json"
     if content is not None:
         file.write_bytes(content)
-    with pytest.raises(ModelFileError, match=r"model\.json: .*wanted a JSON model"):
+    with pytest.raises(ModelFileError, match=r"model\.json: .*wanted a (JSON )?model"):
         margin_of_file(file)
 
 
