@@ -28,6 +28,18 @@ def usable(what: object, wanted: str) -> Generator[None]:
         raise InputError(f"{what}: {error.strerror}, wanted {wanted}") from None
 
 
+def beyond(value: float, limit: float, decimals: int = 0) -> str:
+    """A value with as many decimals as show on which side of a limit it is.
+
+    >>> beyond(334.2, 30.0), beyond(10.02, 10.0), beyond(49.96, 50.0, 1)
+    ('334', '10.02', '49.96')
+    """
+    texts = (f"{value:.{count}f}" for count in range(decimals, 18))
+    return next(
+        (text for text in texts if float(text) != limit and (float(text) > limit) == (value > limit)), f"{value}"
+    )
+
+
 def extra_wanted(module: str | None) -> str:
     """The line about a missing module that an extra of this package installs; empty for any other module."""
     package = (module or "").partition(".")[0]

@@ -14,6 +14,7 @@ from gains.core.structure import strongly_connected_blocks
 from gains.performance.response import formation_loop
 from gains.sampled.constant import growth_rate
 from gains.sampled.onboard import onboard_loop
+from gcs.errors import beyond
 from gcs.link.clocks import REQUEST_LIFETIME_NS
 from gcs.plan.course import nearest_planned
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -87,8 +88,9 @@ def bad_start(scenario: Scenario) -> str | None:
         above_m = scenario.altitude_of(one) - scenario.altitude_of(two) if scenario.dynamics != "autopilot" else 0.0
         apart_m = hypot(dist(one.position_ne_m, two.position_ne_m), above_m)
         if apart_m < safety.collision_distance_m:
-            read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
-            wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
+            least_m = safety.collision_distance_m
+            read = f"vehicles {one.system_id} and {two.system_id} {beyond(apart_m, least_m)} m apart"
+            wanted = f"at least safety.collision_distance_m = {least_m:g} m between any two"
             return f"vehicle {two.system_id}: position_ne_m: read {read}, wanted {wanted}"
     speeds_m_s = [("nominal_velocity", hypot(*entry.velocity_ne_m_s)) for entry in scenario.nominal_velocity]
     for key, speed_m_s in (*speeds_m_s, ("course.speed_m_s", scenario.course.speed_m_s or 0.0)):
@@ -103,7 +105,7 @@ def bad_start(scenario: Scenario) -> str | None:
         wanted_ne_m = [a + o for a, o in zip(ahead, offset, strict=True)]
         error_m = dist(wanted_ne_m, vehicle.position_ne_m)
         if error_m > safety.spacing_error_limit_m:
-            read = f"a spacing error of {error_m:g} m"
+            read = f"a spacing error of {beyond(error_m, safety.spacing_error_limit_m)} m"
             wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"
             return f"vehicle {vehicle.system_id}: position_ne_m: read {read}, wanted {wanted}"
     return _close_places(scenario)
@@ -115,7 +117,9 @@ def _close_places(scenario: Scenario) -> str | None:
     if nearest is None or nearest.distance_m >= least_m:
         return None
     one, two = nearest.system_ids
-    read = f"places of vehicles {one} and {two} {nearest.distance_m:.2f} m apart at {nearest.time_s:.1f} s"
+    read = (
+        f"places of vehicles {one} and {two} {beyond(nearest.distance_m, least_m, 2)} m apart at {nearest.time_s:.1f} s"
+    )
     key = "formation_changes" if scenario.formation_changes else f"vehicle {two}: offset_ne_m"
     return f"{key}: read {read}, wanted at least safety.collision_distance_m = {least_m:g} m"
 

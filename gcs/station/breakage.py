@@ -16,6 +16,7 @@ import numpy as np
 from gcs.control.history import Reports
 from gcs.control.law import Nearest
 from gcs.control.limits import any_beyond
+from gcs.errors import beyond
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.kernel import Record, Records
 
@@ -36,7 +37,8 @@ def not_formed(plan: FlightPlan, history: Reports) -> str:
         north, east = plan.formation.offset_ne_m[row].tolist()
         error_m = hypot(newest[1][0] - ahead[0] - north, newest[1][1] - ahead[1] - east)
         if error_m > limit_m:
-            return f"not formed: vehicle {ids[row]} is {error_m:.0f} m from its place at the start, limit {limit_m:g} m"
+            far = beyond(error_m, limit_m)
+            return f"not formed: vehicle {ids[row]} is {far} m from its place at the start, limit {limit_m:g} m"
     return ""
 
 
@@ -82,7 +84,9 @@ class Breakage:
             error_m = hypot(*error)
             self._has_returned[row] |= not self._away[row] and not error_m > limit_m  # the leader has no spacing error
             if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
-                return f"broken: spacing error of vehicle {ids[row]} is {error_m:.0f} m, limit {limit_m:g} m"
+                return (
+                    f"broken: spacing error of vehicle {ids[row]} is {beyond(error_m, limit_m)} m, limit {limit_m:g} m"
+                )
         self.all_back = all(self._has_returned) and not any(self._away)
         return ""
 

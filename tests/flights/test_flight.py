@@ -330,7 +330,7 @@ def test_a_wide_start_flown_at_three_g_comes_together() -> None:
 @pytest.mark.parametrize(
     ("limit_m", "acts", "reason"),
     [
-        (10.0, True, "broken: spacing error of vehicle 5 is 10 m, limit 10 m"),
+        (10.0, True, "broken: spacing error of vehicle 5 is 10.3 m, limit 10 m"),
         (300.0, True, "completed: duration reached"),
         (300.0, False, "broken: spacing error of vehicle 5 is 301 m, limit 300 m"),
     ],
