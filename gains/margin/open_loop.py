@@ -38,7 +38,9 @@ def delayed_feedback(system: Any) -> tuple[FloatArray, FloatArray]:
         return feedback_of_matrices(system.A, system.B, system.C, system.D)
     if hasattr(system, "num") and hasattr(system, "den"):
         return feedback_of_polynomials(system.num, system.den)
-    raise BadModelError(f"read a {type(system).__name__}; a system with A, B, C, D or with num, den is wanted")
+    raise BadModelError(
+        f"read an object of type {type(system).__name__}; a system with A, B, C, D or with num, den is wanted"
+    )
 
 
 def feedback_of_matrices(

@@ -58,7 +58,7 @@ def test_several_inputs_and_outputs_are_closed_together() -> None:
         (SimpleNamespace(num=[[[1.0], [1.0]]], den=[[[1.0, 0.0], [1.0, 0.0]]]), "num is not one polynomial"),
         (SimpleNamespace(num=[[[1.0], [1.0, 2.0]]], den=[[[1.0]]]), "num is not one polynomial"),
         (SimpleNamespace(num=[1.0], den=[0.0, 0.0]), "num has degree 0|den is zero"),
-        (np.eye(2), "read a ndarray; a system with A, B, C, D or with num, den"),
+        (np.eye(2), "read an object of type ndarray; a system with A, B, C, D or with num, den"),
     ],
 )
 def test_what_is_no_loop_with_delay_is_refused(system: object, said: str) -> None:
