@@ -11,7 +11,7 @@ import typer
 
 from gcs.cli import FAILED, INTERRUPTED, options
 from gcs.cli.front import LinksOf, chosen_for, chosen_now
-from gcs.errors import InputError
+from gcs.errors import InputError, beyond
 from gcs.output import outlive_readers
 from scenarios.networks import networks_of
 
@@ -79,7 +79,7 @@ def fly(
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
-    _refuse_unusable(link_delay, assert_headroom, assert_settled, junit)
+    _refuse_unusable(link_delay, assert_headroom, assert_settled, junit, out)
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
     _refuse_contradictions(sockets, speed, live, virtual=virtual, mirror_commands=mirror_commands)
     scenario = options.load_scenario(scenario_file, loop, without, links=links, allow_code=allow_code)
@@ -145,8 +145,14 @@ def fly(
 
 
 def _refuse_unusable(
-    link_delay_s: float | None, least_headroom: float | None, settled_s: float | None, junit: Path | None
+    link_delay_s: float | None,
+    least_headroom: float | None,
+    settled_s: float | None,
+    junit: Path | None,
+    out: Path | None,
 ) -> None:
+    if out is not None:
+        options.refuse_out(out)
     if link_delay_s is not None:
         options.within("--link-delay", link_delay_s, 0, 60, "seconds")
     if least_headroom is not None:
@@ -160,7 +166,7 @@ def _refuse_unusable(
 def _passed(summary: "Summary", least_headroom: float | None, settled_s: float | None, junit: Path | None) -> bool:
     """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
     from gcs.runs.junit import Check, write_junit
-    from gcs.views.console import number_text
+    from gcs.views.console import UNKNOWN
 
     stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
     checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
@@ -168,15 +174,18 @@ def _passed(summary: "Summary", least_headroom: float | None, settled_s: float |
     if least_headroom is not None:
         met = least is not None and least >= least_headroom
         name = f"the headroom is at least {least_headroom:.1%}"
-        asserted.append(Check(name, "" if met else f"read {number_text(least, '.1%')}"))
+        read = UNKNOWN if least is None else beyond(100.0 * least, 100.0 * least_headroom, 1) + "%"
+        wanted = f"at least {least_headroom:.1%}"
+        asserted.append(Check(name, "" if met else f"--assert-headroom: read {read}, wanted {wanted}"))
     if settled_s is not None:
         met = after_s is not None and after_s <= settled_s
         name = f"the errors settle within {settled_s:g} s"
-        asserted.append(Check(name, "" if met else f"read {number_text(after_s, '.2f')} s"))
+        read = "errors that did not settle" if after_s is None else f"{beyond(after_s, settled_s, 2)} s"
+        asserted.append(Check(name, "" if met else f"--assert-settled: read {read}, wanted at most {settled_s:g} s"))
     if junit is not None:
         write_junit(junit, f"gcs fly {summary.scenario}", [*checks, *asserted], time_s=summary.duration_s or 0.0)
     for failed in (check for check in asserted if check.failure):
-        print(f"failed: {failed.name}: {failed.failure}", file=sys.stderr)
+        print(f"failed: {failed.failure}", file=sys.stderr)
     return not any(check.failure for check in [*checks, *asserted])
 
 

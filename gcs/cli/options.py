@@ -160,6 +160,23 @@ def out_folder(out: Path, wanted: str = "a new or empty folder", option: str = "
     return out
 
 
+def refuse_out(out: Path, wanted: str = "a new or empty folder") -> None:
+    """Refuse an --out that cannot be used, before any work is done for it; leaves no new folder behind."""
+    new = not out.exists()
+    out_folder(out, wanted)
+    if new:
+        out.rmdir()
+
+
+def campaign_folder(out: Path | None, flag: str, kind: str) -> Path:
+    """The folder in --out that holds a campaign or another `kind` of study, which `flag` needs."""
+    if out is None:
+        raise InputError(f"{flag}: read no --out, wanted --out with the folder of a {kind}")
+    if not out.is_dir():
+        raise InputError(f"--out: read {out}, wanted the folder of a {kind}, which {flag} needs")
+    return out
+
+
 def run_folder(out: Path | None, name: str) -> Path:
     """The folder that --out names, or a new one in runs/ with a name and the time."""
     from gcs.drive.fly import new_folder

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gcs.stress.trial import Outcome
 
 _AXIS = "FROM:TO:N"
+_OUT_WANTED = "a new or empty folder, or --resume"
 DISTURBANCE_FILE = "disturbance.json"
 
 
@@ -97,9 +98,10 @@ def stress(
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]
     onset = onset or onset_of is not None or assert_onset is not None
-    if (trial or resume) and (out is None or not out.is_dir()):
-        flag = "--trial" if trial else "--resume"
-        raise InputError(f"--out: read {out}, wanted the folder of a campaign, which {flag} needs")
+    if trial or resume:
+        out = options.campaign_folder(out, "--trial" if trial else "--resume", "campaign")
+    elif out is not None:
+        options.refuse_out(out, _OUT_WANTED)
     _refuse_axes(given, prediction, searches=bool(trial or onset or disturbance))
     given += [("--prediction", prediction)] if prediction else []
     for name, value in (("--tolerance", tolerance), ("--assert-onset", assert_onset)):
@@ -299,7 +301,7 @@ def _campaign(
         if out is None:
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
-            folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
+            folder = out if resume else options.out_folder(out, _OUT_WANTED)
         write_whole(folder / SCENARIO_FILE, scenario.encode())
         write_code(study.plan.scenario, folder)
         store = stack.enter_context(contextlib.closing(trials_of(folder)))

@@ -170,8 +170,8 @@ def capacity(
     from gcs.studies.capacity import capacity as capacity_of
     from gcs.views.console import progress
 
-    if resume and (out is None or not out.is_dir()):
-        raise InputError(f"--out: read {out}, wanted the folder of a study, which --resume needs")
+    if resume:
+        out = options.campaign_folder(out, "--resume", "study")
     rates_hz = _rates(rates)
     wanted = "a scenario without code: gcs capacity changes its formation"
     scenario = options.load_scenario(scenario_file, allow_code=wanted)

@@ -46,12 +46,13 @@ _FORM = "FROM:TO:N"
 _MOST = 10_000
 """Most values of an axis."""
 _RANGES = {
-    "delay": (0.0, 60.0),
-    "jitter": (0.0, 10.0),
-    "loss": (0.0, 1.0),
-    "rate": (1.0, 500.0),
-    PREDICTION: (0.0, PREDICTION_MAX_S),
+    "delay": (0.0, 60.0, " s"),
+    "jitter": (0.0, 10.0, " s"),
+    "loss": (0.0, 1.0, ""),
+    "rate": (1.0, 500.0, " Hz"),
+    PREDICTION: (0.0, PREDICTION_MAX_S, " s"),
 }
+"""The least and the largest value on each axis, and its unit."""
 
 
 def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis:
@@ -61,7 +62,7 @@ def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis
     the text has neither form, or a value is out of range.
     """
     name = option.removeprefix("--")
-    low, high = _RANGES[name.split("-", maxsplit=1)[0]]
+    low, high, unit = _RANGES[name.split("-", maxsplit=1)[0]]
     if name == "delay-of":
         system_id, equals, values_text = text.partition("=")
         if not equals or system_id not in map(str, system_ids):
@@ -80,7 +81,7 @@ def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis
     # rounded to what a user would write, so that ids do not depend on how a range was divided
     values = [round(value, 9) for value in values]
     if not values or not all(low <= value <= high for value in values):
-        wanted = f"{_FORM} or values as 0.1,0.2, from {low:g} to {high:g}, at most {_MOST}"
+        wanted = f"{_FORM} or a list such as 0.1,0.2, of at most {_MOST} values from {low:g} to {high:g}{unit}"
         raise InputError(f"{option}: read {text!r}, wanted {wanted}")
     return Axis(name, tuple(dict.fromkeys(values)))
 
@@ -125,7 +126,15 @@ def every_link(scenario: Scenario) -> list[Link]:
 
 
 def place_text(coordinates: Mapping[str, float]) -> str:
-    return ", ".join(f"{name.replace('_', ' of ')} {value:g}" for name, value in coordinates.items())
+    """The values on the axes with their units.
+
+    >>> place_text({"delay_2": 0.3, "loss": 0.1})
+    'delay of vehicle 2 0.3 s, loss 0.1'
+    """
+    units = {name: _RANGES[name.split("_", maxsplit=1)[0]][2] for name in coordinates}
+    return ", ".join(
+        f"{name.replace('_', ' of vehicle ')} {value:g}{units[name]}" for name, value in coordinates.items()
+    )
 
 
 def split_delay(total_s: float, period_s: float) -> tuple[float, float]:

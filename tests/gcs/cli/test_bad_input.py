@@ -65,7 +65,16 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"stress {CHAIN} --onset --junit {{run}}", "run: Is a directory, wanted a file that can be written"),
         (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a fraction between 0 and 1"),
         (f"stress {CHAIN} --delay 0:x:3", "--delay: "),
-        (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:N or values"),
+        (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:N or a list"),
+        (f"stress {CHAIN} --delay 0:600:3", "0.1,0.2, of at most 10000 values from 0 to 60 s"),
+        (f"stress {CHAIN} --rate 0", "from 1 to 500 Hz"),
+        (
+            f"stress {CHAIN} --onset --trial x --out README.md",
+            "--out: read README.md, wanted the folder of a campaign,",
+        ),
+        (f"capacity {CHAIN} --resume", "--resume: read no --out, wanted --out with the folder of a study"),
+        (f"fly {CHAIN} --virtual --out README.md", "--out: README.md: File exists, wanted a folder that can"),
+        (f"fly {CHAIN} --virtual --out {{run}}", "run is not empty, wanted a new or empty folder"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
     ],
 )

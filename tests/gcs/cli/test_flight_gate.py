@@ -1,5 +1,6 @@
 """A flight as a gate in CI: assertions, exit codes and JUnit XML."""
 
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -42,7 +43,9 @@ def test_each_assertion_that_fails_is_named(
     suite = ElementTree.parse(junit).getroot()
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert failed == ["the headroom is at least 90.0%", "the errors settle within 0.1 s"]
-    assert [line.split(":")[1].strip() for line in capfd.readouterr().err.splitlines()] == failed
+    headroom, settled = capfd.readouterr().err.splitlines()
+    assert re.fullmatch(r"failed: --assert-headroom: read \d\d\.\d%, wanted at least 90\.0%", headroom)
+    assert re.fullmatch(r"failed: --assert-settled: read \d+\.\d+ s, wanted at most 0\.1 s", settled)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +54,7 @@ def test_each_assertion_that_fails_is_named(
         ("--assert-headroom", "1.5", "--assert-headroom: read 1.5, wanted a number from -1000 to 1"),
         ("--assert-settled", "-1", "--assert-settled: read -1, wanted seconds from 0"),
         ("--junit", "/", "--junit: /: Is a directory"),
+        ("--link-delay", "61", "--link-delay: read 61, wanted seconds from 0 to 60"),
     ],
 )
 def test_what_no_flight_can_show_is_refused_before_it(
