@@ -8,11 +8,13 @@ from rich.console import Console
 from rich.text import Text
 
 from gcs.cli.runs import print_grade
+from gcs.runs.files import read_summary
 from gcs.runs.junit import Check
+from gcs.runs.record import SUMMARY_FILE
 from gcs.stress.axes import place_text
 from gcs.stress.campaign import Reflown
 from gcs.stress.disturbance import DisturbanceOnset, DisturbanceResult
-from gcs.stress.report import MOST_ROWS, REPORT_FILE, RESULT_FILE, CampaignResult, Noise, refly_command
+from gcs.stress.report import MOST_ROWS, CampaignResult, Noise, refly_command
 from gcs.stress.study import Onset
 from gcs.stress.trial import Outcome
 from gcs.studies.benchmark import Benchmark, RealTimeBenchmark
@@ -22,7 +24,7 @@ from gcs.studies.compare import Route, rows
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
 from gcs.studies.peers import Row, SideBySide
 from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
-from gcs.views.report import response_text
+from gcs.views.report import flight_lines, response_text
 from scenarios.schema import Scenario
 
 _ms = partial(ms_text, form=".2f")
@@ -81,7 +83,8 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     for failed in result.trials_failed:
         fault = (failed.error or "").strip().splitlines()[-1]
         console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {fault}")
-    console.print(f"files    {folder}: {REPORT_FILE}, {RESULT_FILE}, trials.jsonl, trials.parquet")
+    files = sorted(file.name for file in folder.iterdir() if file.is_file())
+    console.print(f"files    {folder}: {', '.join(files)}")
     if result.worst:
         console.print(f"again    {refly_command(folder, result.worst[0])}")
     if result.failure:
@@ -128,7 +131,7 @@ def _columns(axes: list[str]) -> dict[str, Callable[[Outcome], str]]:
 def print_reflown(reflown: Reflown) -> None:
     console, outcome = plain_console(), reflown.outcome
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
-    console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
+    console.print(f"verdict  {outcome.verdict}: {_reason(reflown)}")
     if outcome.growth_1_s is not None:
         of = f" of vehicle {outcome.probed}" if outcome.probed is not None else ""
         console.print(
@@ -145,6 +148,16 @@ def print_reflown(reflown: Reflown) -> None:
         console.print(f"look     gcs view {run}")
     if outcome.error is not None:
         console.print(outcome.error)
+
+
+def _reason(reflown: Reflown) -> str | None:
+    """The reason of a trial's verdict as `gcs fly` tells it, from the summary of the flight that was judged."""
+    outcome, flown = reflown.outcome, (read_summary(run / SUMMARY_FILE) for run in reflown.runs)
+    judged = (outcome.reason, outcome.spacing_error_final_m)
+    found = next((own for own in flown if (own.reason, own.spacing_error_final_m) == judged), None)
+    if found is None:
+        return outcome.reason
+    return flight_lines(found.model_copy(update={"verdict": outcome.verdict}))["verdict"]
 
 
 def checks_of(result: CampaignResult) -> list[Check]:

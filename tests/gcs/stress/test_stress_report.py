@@ -2,6 +2,7 @@
 
 import json
 import re
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -157,12 +158,30 @@ def test_the_printed_command_reflies_a_trial_to_the_last_bit(tmp_path: Path) -> 
     scenario, *options = printed_replay(output)
     result = CliRunner().invoke(app, [scenario, *options])
     assert result.exit_code == 0, result.output
-    assert "verdict  unstable" in result.output
+    assert re.search(r"^verdict  unstable: (not settled in|broken: )", result.output, re.MULTILINE)
     assert "identical to the last bit" in result.output
     [recording] = (out / "flights").rglob("flight.rrd")
     assert recording.stat().st_size > 0
     summary = json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))
     assert (summary["scenario"], summary["verdict"]) == ("pair", "unstable")
+
+
+@pytest.mark.parametrize("loss", ["0", "0.1"])
+def test_a_reflown_trial_is_told_as_a_flight(loss: str, tmp_path: Path) -> None:
+    """At 0.32 s of loop delay errors grow by a few percent a second: the flight is completed, and unstable."""
+    out = tmp_path / "out"
+    output = run(tmp_path, "--delay", "0.31", "--loss", loss, "--out", str(out), duration_s=6.0)
+    [files] = [line for line in output.splitlines() if line.startswith("files")]
+    assert files == f"files    {out}: {', '.join(sorted(file.name for file in out.iterdir()))}"
+    assert {"scenario.toml", "worst.png"} <= set(files.replace(",", "").split())
+    with closing(trials_of(out)) as store:
+        trials = list(store.flown.values())
+    for trial in trials:
+        told = run(tmp_path, "--trial", trial.id, "--out", str(out), duration_s=6.0)
+        assert f", delay 0.31 s, loss {loss}\n" in told
+        [verdict] = [line for line in told.splitlines() if line.startswith("verdict")]
+        if trial.verdict == "unstable":
+            assert f"final spacing error {trial.spacing_error_final_m:.2f} m, largest" in verdict or "broken" in verdict
 
 
 def test_both_flights_of_a_pair_are_kept_and_differences_reported(tmp_path: Path) -> None:
