@@ -148,16 +148,20 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
         root, verdict = found.rightmost_root, "stable" if found.is_stable else "not stable"
         console.print(f"{verdict}: rightmost root {root.real:.6g} +- {root.imag:.6g}j 1/s")
         return
-    margin = found.margin if isinstance(found, ScenarioMargin) else found
+    by, margin = "", found.margin if isinstance(found, ScenarioMargin) else found
+    if isinstance(found, ScenarioMargin):  # first what is flown, then its model
+        loop, flown, *more = margin.notes
+        console.print(f"{flown}\n{loop}")
+        by, margin = "continuous model: ", replace(margin, notes=tuple(more))
     for line in _verdict_lines(margin):
-        console.print(line)
+        console.print(f"{by}{line}")
     if margin.crossings:
         columns: dict[str, Callable[[MarginCrossing], str]] = {
             "omega rad/s": _omega,
             "period s" if margin.unknown == "period" else "delay s": lambda c: as_known(c.delay_s, c.delay_error_s),
             "roots go": lambda c: {1: "right: unstable", -1: "left: stable", 0: "touch"}[c.direction],
         }
-        console.print(table_of(margin.crossings[:_ROWS], columns, title="crossings of the stability boundary"))
+        console.print(table_of(margin.crossings[:_ROWS], columns, title=f"{by}crossings of the stability boundary"))
         if len(margin.crossings) > _ROWS:
             console.print(f"and {len(margin.crossings) - _ROWS} more crossings")
     for note in margin.notes:

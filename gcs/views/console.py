@@ -14,6 +14,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from gcs.errors import beyond
+
 UNKNOWN = "–"
 
 Item = TypeVar("Item")
@@ -37,6 +39,17 @@ def number_text(value: float | None, form: str = ".5f", *, factor: float = 1) ->
 def ms_text(seconds: float | None, form: str = ".1f", *, unit: str = " ms") -> str:
     """A time in milliseconds, or a dash for None and NaN."""
     return UNKNOWN if seconds is None or isnan(seconds) else f"{1e3 * seconds:{form}}{unit}"
+
+
+def growth_text(factor: float | None) -> str:
+    """What errors do that grow by at most a factor, None without bound; rounding makes 1 differ from 1 by 1e-10.
+
+    >>> growth_text(1.0), growth_text(1.004), growth_text(1.15), growth_text(None)
+    ('do not grow', 'grow at most 1.004 times', 'grow at most 1.15 times', 'grow without bound')
+    """
+    if factor is None:
+        return "grow without bound"
+    return "do not grow" if factor <= 1.0 + 1e-6 else f"grow at most {beyond(factor, 1.0, 2)} times"
 
 
 def table_of(

@@ -21,7 +21,7 @@ from gcs.plan.design import (
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
 from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
-from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
+from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_console, table_of
 from scenarios.schema import GainBlock
 
 _HASH = 12
@@ -151,7 +151,8 @@ _WINDOW_COLUMNS: dict[str, Callable[[WindowAt], str]] = {
 
 
 def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:
-    console.print(f"         {figures_text(flown)} (that of the scenario's links)")
+    at = "at the {} of loop delay that the scenario's links give"
+    console.print(f"         {figures_text(flown, at)}")
     if flown.alpha_kept is None:
         return
     kept = f"at least {flown.alpha_kept:.4f} {_up_to(flown.alpha_kept_to_s)}"
@@ -159,17 +160,16 @@ def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> 
         console.print(f"         {kept}")
         console.print("string   no verdict: with gains on a general pattern errors do not propagate along a chain")
         return
-    growth = f"growth at most {flown.string_peak_kept:.2f} times {_up_to(flown.string_peak_kept_to_s)}"
-    console.print(f"         {kept}; {growth}")
+    until = _up_to(flown.string_peak_kept_to_s)
+    console.print(f"         {kept}; {until} spacing errors {growth_text(flown.string_peak_kept)}")
 
 
-def figures_text(flown: FiguresAtDelay) -> str:
+def figures_text(flown: FiguresAtDelay, at: str = "at {} of loop delay") -> str:
     """α at a loop delay and, where spacing errors propagate along a chain, their growth there, in words."""
-    alpha = f"{flown.alpha:.4f} at {ms_text(flown.loop_delay_s)} of loop delay"
+    delay = at.format(ms_text(flown.loop_delay_s))
     if not flown.has_string_verdict:
-        return f"{alpha}, of the whole formation"
-    grows = "without bound" if flown.string_peak is None else f"{flown.string_peak:.2f} times at most"
-    return f"{alpha}, where spacing errors grow {grows} from vehicle to vehicle"
+        return f"{flown.alpha:.4f} of the whole formation {delay}"
+    return f"{flown.alpha:.4f} {delay}, where spacing errors {growth_text(flown.string_peak)} from vehicle to vehicle"
 
 
 def _up_to(delay_s: float | None) -> str:
@@ -326,7 +326,7 @@ def response_text(response: ResponsePart | None) -> str:
     late_ms = sorted(round(1e3 * vehicle.dead_time_s) for vehicle in response.vehicles)
     dead = f", dead time {' to '.join(dict.fromkeys(map(str, (late_ms[0], late_ms[-1]))))} ms" if late_ms[-1] else ""
     peak = response.string_peak
-    grows = "" if peak is None else f"; spacing errors grow {peak:.2f} times at most from vehicle to vehicle with it"
+    grows = "" if peak is None else f"; with it spacing errors {growth_text(peak)} from vehicle to vehicle"
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
         f"response {response.source} ({', '.join(models)}): lag {lag} s{dead}, velocity gain {gain} 1/s; included in "

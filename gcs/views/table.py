@@ -25,7 +25,7 @@ from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.mismatch import assumption
 from gcs.runs.refusals import REFUSED
-from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, ms_text, not_shown, number_text
+from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, growth_text, ms_text, not_shown, number_text
 from gcs.views.scene import Newest
 from scenarios.schema import Scenario
 
@@ -98,8 +98,7 @@ class FlightState:
         key = round(1e3 * delay_s), gain_set
         if key not in self._at_delay:
             found = figures_at(self._design, self.scenario, key[0] / 1e3, gain_set)
-            bound = "without bound" if found.string_peak is None else f"{found.string_peak:.2f} times"
-            grows = f", errors grow {bound}" if found.has_string_verdict else ""
+            grows = f", errors {growth_text(found.string_peak)}" if found.has_string_verdict else ""
             text = "" if found.alpha is None else f"alpha {found.alpha:.3f}{grows} at {key[0]} ms"
             self._at_delay[key] = text
         return self._at_delay[key]

@@ -252,7 +252,9 @@ def test_a_scenario_has_the_margins_of_the_loop_it_flies(
     assert result["delay_margin_sampled_s"] == pytest.approx(sampled_s, rel=1e-5)
     assert result["checked_by"]
     print_margin(found)
-    assert f"as flown, sampled and held every 20 ms: margin {sampled_s}" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"as flown, sampled and held every 20 ms: margin {sampled_s}")
+    assert f"continuous model: margin {continuous_s}" in shown
 
 
 def test_a_scenario_that_predicts_has_its_windows_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -83,7 +83,7 @@ def test_table_and_summary_tell_both_at_the_measured_loop_delay() -> None:
     rows = flight.ticks.reshape(-1, 5)
     state.add(rows[(rows["time_s"][:, 0] > 3.0) & (rows["time_s"][:, 0] < 5.9)], [])
     assert f"alpha {told.alpha:.2f}" in plain_line(state)
-    assert f"errors grow {told.string_peak:.1f}" in plain_line(state)
+    assert f"errors grow at most {told.string_peak:.1f}" in plain_line(state)
 
 
 def test_alpha_is_that_of_the_slowest_vehicles_own_gains() -> None:
@@ -119,7 +119,9 @@ def test_general_pattern_gains_have_formation_alpha_and_no_string_verdict() -> N
     console = Console(file=io.StringIO(), width=200)
     print_design(design, console)
     text = cast("io.StringIO", console.file).getvalue()
-    assert f"{told.alpha:.4f} at 210.0 ms of loop delay, of the whole formation" in text
+    assert (
+        f"{told.alpha:.4f} of the whole formation at the 210.0 ms of loop delay that the scenario's links give" in text
+    )
     assert "no verdict: with gains on a general pattern errors do not propagate along a chain" in text
 
 
@@ -148,3 +150,12 @@ def test_general_pattern_flights_tell_alpha_at_the_measured_delay() -> None:
     state.add(rows[rows["time_s"][:, 0] > 2.0], [])
     assert f"alpha {told.alpha:.2f}" in plain_line(state)
     assert "errors grow" not in plain_line(state)
+
+
+def test_errors_that_do_not_grow_are_said_not_to() -> None:
+    console = Console(file=io.StringIO(), width=200)
+    print_design(flight_plan(TRIANGLE)[0], console)
+    text = cast("io.StringIO", console.file).getvalue()
+    assert "that the scenario's links give, where spacing errors do not grow from vehicle to vehicle\n" in text
+    assert "; up to 160.7 ms spacing errors do not grow\n" in text
+    assert "1.00 times" not in text
