@@ -21,10 +21,12 @@ def location_of(key: str) -> Location:
 def place_of(key: str, text: str, data: Mapping[str, Any]) -> str:
     """The line of a key in a TOML text, if it has one, and its name: "line 9: vehicle 2: follows".
 
-    The key is one such as "vehicles[1].follows", or names the vehicle already.
+    The key is one such as "vehicles[1].follows", or names the vehicle already, which need not be in the text.
     """
     if of_vehicle := _OF_VEHICLE.fullmatch(key):
         ids = [vehicle["system_id"] for vehicle in data["vehicles"]]
+        if int(of_vehicle[1]) not in ids:
+            return key
         key = f"vehicles[{ids.index(int(of_vehicle[1]))}].{of_vehicle[2]}"
     line = line_of(text, location_of(key))
     return named(key, data) if line is None else f"line {line}: {named(key, data)}"

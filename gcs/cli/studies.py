@@ -166,7 +166,7 @@ def capacity(
     The links carry a formation if its loop delay stays within the delay margin.
     """
     from gcs.cli.results import print_capacity
-    from gcs.studies.capacity import LoadStore
+    from gcs.studies.capacity import SECONDS, LoadStore, formations_at_most, unflyable
     from gcs.studies.capacity import capacity as capacity_of
     from gcs.views.console import progress
 
@@ -175,11 +175,17 @@ def capacity(
     rates_hz = _rates(rates)
     wanted = "a scenario without code: gcs capacity changes its formation"
     scenario = options.load_scenario(scenario_file, allow_code=wanted)
+    options.refuse(scenario_file, unflyable(scenario, most))
     with contextlib.ExitStack() as stack:
         store = None
         if out is not None:
             folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
             store = stack.enter_context(contextlib.closing(LoadStore(folder, scenario, resume=resume)))
+        options.say_if_first_flight()
+        if not as_json:
+            each = f"up to {seeds} flights of {SECONDS:g} s" if seeds > 1 else f"one flight of {SECONDS:g} s"
+            count = formations_at_most(len(rates_hz), most)
+            typer.echo(f"flights  at most {count} formations, {each} each", err=True)
         begin = stack.enter_context(progress(shown=not as_json))
         found = capacity_of(
             scenario,

@@ -105,19 +105,11 @@ def capacity(
 
     Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
     decay slowly near the margin. `fly` flies in the place of `fly_loaded`; `ended` is called after each formation with
-    the greatest number still to come. Raises InputError if the scenario gives gains as blocks of its own formation, its
-    vehicles take off first, or it cannot fly.
+    the greatest number still to come. Raises InputError if the scenario is `unflyable`.
     """
-    if blocks := len(scenario.control.blocks):
-        wanted = "gains for any number of vehicles"
-        raise InputError(f"{scenario.name}: control.blocks: read {blocks} of them, wanted {wanted}")
-    if scenario.dynamics != "double_integrator":
-        wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
-        raise InputError(f"{scenario.name}: dynamics: read {scenario.dynamics!r}, wanted {wanted}")
-    scenario = scenario.model_copy(update={"duration_s": seconds})
-    formed = _displaced(with_vehicles(scenario, most))
-    if fault := bad_start(formed) or endless_link(formed):
+    if fault := unflyable(scenario, most, seconds):
         raise InputError(f"{scenario.name}: {fault}")
+    scenario = scenario.model_copy(update={"duration_s": seconds})
     found: list[Capacity] = []
     for k, rate_hz in enumerate(rates_hz):
         own, low, count = Capacity(rate_hz, most=None, next=None), FEWEST - 1, FEWEST
@@ -129,10 +121,28 @@ def capacity(
             else:
                 own, low = (replace(own, most=load), count) if load.holds else (replace(own, next=load), low)
                 count = min(2 * low, most) if own.next is None else (low + own.next.vehicles) // 2
-            later = len(rates_hz) - 1 - k
-            ended(_at_most(low, count, own.next, most) + later * _at_most(FEWEST - 1, FEWEST, None, most))
+            ended(_at_most(low, count, own.next, most) + formations_at_most(len(rates_hz) - 1 - k, most))
         found.append(own)
     return found
+
+
+def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | None:
+    """The fault of a scenario of gains for its own formation only, of vehicles that take off first, or that cannot fly.
+
+    None if formations of up to `most` vehicles can be flown.
+    """
+    if blocks := len(scenario.control.blocks):
+        return f"control.blocks: read {blocks} of them, wanted gains for any number of vehicles"
+    if scenario.dynamics != "double_integrator":
+        wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
+        return f"dynamics: read {scenario.dynamics!r}, wanted {wanted}"
+    formed = _displaced(with_vehicles(scenario.model_copy(update={"duration_s": seconds}), most))
+    return bad_start(formed) or endless_link(formed)
+
+
+def formations_at_most(rates: int, most: int) -> int:
+    """The greatest number of formations that a study of so many rates flies, up to `most` vehicles."""
+    return rates * _at_most(FEWEST - 1, FEWEST, None, most)
 
 
 def _at_most(low: int, count: int, beyond: Load | None, most: int) -> int:

@@ -80,6 +80,12 @@ def test_json_holds_what_is_shown() -> None:
     assert found["next"] is None
 
 
+def test_a_study_says_at_first_how_many_flights_it_has() -> None:
+    result = CliRunner().invoke(app, ["capacity", str(RADIO), "--rates", "10", "--most", "2", "--seeds", "1"])
+    assert result.exit_code == 0, result.output
+    assert result.stderr == "flights  at most 2 formations, one flight of 180 s each\n"
+
+
 @pytest.mark.parametrize("rates", ["", "ten", "0.5", "5,nan"])
 def test_bad_rates_are_refused_in_one_line(rates: str) -> None:
     result = CliRunner().invoke(app, ["capacity", str(RADIO), "--rates", rates])
