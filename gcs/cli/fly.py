@@ -27,7 +27,10 @@ def fly(
     links: options.LinksOption = None,
     links_of: LinksOf = None,
     link_delay: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="constant delay of every link, each way")
+        float | None,
+        typer.Option(
+            metavar="SECONDS", help="constant delay of every link, each way; --delay of gcs stress is up + down"
+        ),
     ] = None,
     without: Annotated[
         list[int] | None,

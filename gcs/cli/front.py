@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 LinksOf = Annotated[
     Path | None,
     typer.Option(
-        "--links-of", metavar="RUN|FILE.tlog", help="choose gains for the links in this run or log (control.for_link)"
+        "--links-of",
+        metavar="RUN|FILE.tlog",
+        help="choose the gains for the links that this run or log shows; the scenario keeps its own links",
     ),
 ]
 Front = Annotated[

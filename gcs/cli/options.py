@@ -54,7 +54,11 @@ LoopOption = Annotated[
 ]
 LinksOption = Annotated[
     str | None,
-    typer.Option("--links", metavar="NAME|FILE", help="fly over this link profile (see gcs scenarios --links)"),
+    typer.Option(
+        "--links",
+        metavar="NAME|FILE",
+        help="replace the scenario's links with this profile (see gcs scenarios --links)",
+    ),
 ]
 KeyFile = Annotated[
     Path | None,

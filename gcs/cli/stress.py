@@ -33,9 +33,11 @@ DISTURBANCE_FILE = "disturbance.json"
 
 def stress(
     scenario_file: options.ScenarioFile,
-    delay: Annotated[str, typer.Option(metavar=_AXIS, help="link delay in s, up + down")] = "",
+    delay: Annotated[
+        str, typer.Option(metavar=_AXIS, help="link delay in s, up + down; --link-delay of gcs fly is each way")
+    ] = "",
     delay_of: Annotated[
-        list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="link delay in s of one vehicle; repeatable")
+        list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="the same of one vehicle; may be repeated")
     ] = None,
     jitter: Annotated[
         str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
@@ -44,7 +46,7 @@ def stress(
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     prediction: Annotated[
         str,
-        typer.Option(metavar="S,S", help="with a map: assumed loop delays in s, 0 without prediction, side by side"),
+        typer.Option(metavar="S,S", help="with two axes: a map for each of these assumed loop delays in s; 0 is off"),
     ] = "",
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
@@ -84,9 +86,10 @@ def stress(
     """Raise the link delay until the formation breaks.
 
     --delay, --delay-of, --jitter, --loss and --rate take FROM:TO:N (N values, ends included) or a list (0.1,0.2,0.4).
-    One of them makes a sweep, two make a map, and --prediction maps beside each other. The loop delay is the link delay
-    plus the wait for the control tick. The measured onset is compared with the delay margin. --onset gives all vehicles
-    links of one delay; --onset-of finds how much more one vehicle's link takes beside those of the scenario.
+    One of them makes a sweep, two make a map; --prediction then draws a map for each assumed delay, side by side. The
+    loop delay is the link delay plus the wait for the control tick. The measured onset is compared with the delay
+    margin. --onset gives all vehicles links of one delay; --onset-of finds how much more delay the link of one vehicle
+    takes, with all other links as in the scenario.
 
     With --disturbance and --onset, every vehicle is disturbed by w = D e, where e are the errors, at one link delay:
     that of the scenario, or one --delay. The worst D is scaled up, and the onset compared with the stability radii.

@@ -49,7 +49,9 @@ def compare(
 
 
 def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode = False) -> None:
-    """Find how the vehicles of a scenario respond, in a short flight in virtual time, and print it as [response].
+    """Find how the vehicles of a scenario respond to set-points.
+
+    They fly briefly in virtual time, and the answer is printed as the table [response] of a scenario.
 
     For dynamics = "jsbsim" and dynamics in a Python file; autopilots are identified in flight.
     """

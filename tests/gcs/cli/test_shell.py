@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import NoReturn
 
 import pytest
+from typer.testing import CliRunner
 
-from gcs.cli.main import main
+from gcs.cli.main import app, main
 from scenarios.files import dump, load
 from scenarios.schema import Control, FixedGains
 from tests.support.paths import SCENARIOS
@@ -58,3 +59,21 @@ def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
     with pytest.raises(SystemExit) as ended:
         main()
     return ended.value.code
+
+
+def test_no_command_is_cut_in_the_list_of_commands() -> None:
+    """In a terminal of 80 columns; what is too long ends in three dots."""
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    commands = shown.partition("Commands:\n")[2].splitlines()
+    assert len(commands) == len(app.registered_commands)
+    assert [line for line in commands if not line.endswith(".") or line.endswith("...")] == []
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [("stress", "--link-delay of gcs fly"), ("fly", "--delay of gcs stress")]
+)
+def test_help_says_that_delays_of_links_differ(command: str, option: str) -> None:
+    shown = " ".join(CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "80"}).output.split())
+    assert option in shown
+    assert "each way" in shown
+    assert "up + down" in shown
