@@ -225,7 +225,7 @@ def one_link(runner: Runner) -> str:
         cells = (_ms(onset["predicted_s"], 2), _ms(onset["loop_delay_s"], 2), f"{100 * onset['difference']:+.3f} %")
         left = _ms(onset["link_delay_left_s"], 1)
         rows.append((f"`{name}`", str(vehicle), _ms(result["delay_margin_s"]), *cells, _share(curve), left))
-    head = ("scenario", "vehicle", "margin", "predicted", "onset in flight", "difference", "curve", "link may take more")
+    head = ("scenario", "vehicle", "margin", "predicted", "onset in flight", "difference", "curve", "link takes more")
     return table(head, rows)
 
 

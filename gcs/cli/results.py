@@ -57,8 +57,11 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     console.print(f"trials   {result.trials}: {kinds}")
     for onset in (found for found in (result.onset, result.onset_shorter) if found is not None):
         breaks = "" if onset.frequency_rad_s is None else f"; breaks at {onset.frequency_rad_s:.2f} rad/s"
-        found = f"{_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight"
-        console.print(f"onset    {found}{_against(result, onset)}")
+        found = f"{_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms of loop delay in flight"
+        console.print(f"onset    {found}, {_against(result, onset)}")
+        if onset.predicted_continuous_s is not None:
+            continuous = "by the continuous model, in which the hold counts as half a period"
+            console.print(f"         {_ms(onset.predicted_continuous_s)} {continuous}")
         whose = f"vehicle {onset.vehicle} alone" if onset.vehicle is not None else "every vehicle"
         left_s = onset.link_delay_left_s
         left = "" if left_s is None else f", {_ms(left_s, form='+.2f')} from the scenario's"
@@ -94,14 +97,12 @@ def print_result(result: CampaignResult, folder: Path) -> None:
 def _against(result: CampaignResult, onset: Onset) -> str:
     """How far an onset is from what was computed, as far as anything was."""
     if onset.difference is None:
-        return ", with no margin to compare it with"
+        return "with no margin to compare it with"
     limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
-    text = f", {onset.difference:+.3%} from the {limit} of this loop, {_ms(onset.predicted_s)}"
+    shared = ""
     if onset.vehicle is not None and len(onset.loop) > 1:
-        text += f" for vehicle {onset.vehicle}, which vehicles {' '.join(map(str, onset.loop))} share"
-    if onset.predicted_continuous_s is None:
-        return text
-    return f"{text}; continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
+        shared = f", which vehicles {' '.join(map(str, onset.loop))} share"
+    return f"{onset.difference:+.3%} from the {limit} of this loop{shared}: {_ms(onset.predicted_s)}"
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:
