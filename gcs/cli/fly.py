@@ -1,7 +1,6 @@
 """`gcs fly` and `gcs key`: the options of a flight and its exit code."""
 
 import contextlib
-import sys
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -158,8 +157,7 @@ def _refuse_unusable(
         options.refuse_out(out)
     if link_delay_s is not None:
         options.within("--link-delay", link_delay_s, 0, 60, "seconds")
-    if least_headroom is not None:
-        options.within("--assert-headroom", least_headroom, -1e3, 1.0)
+    options.refuse_headroom(least_headroom)
     if settled_s is not None:
         options.within("--assert-settled", settled_s, 0.0, 1e6, "seconds")
     if junit is not None:
@@ -169,17 +167,13 @@ def _refuse_unusable(
 def _passed(summary: "Summary", least_headroom: float | None, settled_s: float | None, junit: Path | None) -> bool:
     """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
     from gcs.runs.junit import Check, write_junit
-    from gcs.views.console import UNKNOWN
 
     stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
     checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
     least, after_s, asserted = summary.headroom_min, summary.settling_time_s, list[Check]()
     if least_headroom is not None:
-        met = least is not None and least >= least_headroom
-        name = f"the headroom is at least {least_headroom:.1%}"
-        read = UNKNOWN if least is None else beyond(100.0 * least, 100.0 * least_headroom, 1) + "%"
-        wanted = f"at least {least_headroom:.1%}"
-        asserted.append(Check(name, "" if met else f"--assert-headroom: read {read}, wanted {wanted}"))
+        unmet = options.unmet_headroom(least, least_headroom)
+        asserted.append(Check(f"the headroom is at least {least_headroom:.1%}", unmet))
     if settled_s is not None:
         met = after_s is not None and after_s <= settled_s
         name = f"the errors settle within {settled_s:g} s"
@@ -188,7 +182,7 @@ def _passed(summary: "Summary", least_headroom: float | None, settled_s: float |
     if junit is not None:
         write_junit(junit, f"gcs fly {summary.scenario}", [*checks, *asserted], time_s=summary.duration_s or 0.0)
     for failed in (check for check in asserted if check.failure):
-        print(f"failed: {failed.failure}", file=sys.stderr)
+        options.say_failed(failed.failure)
     return not any(check.failure for check in [*checks, *asserted])
 
 

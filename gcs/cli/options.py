@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from gcs.errors import InputError, usable
+from gcs.errors import InputError, beyond, usable
 
 if TYPE_CHECKING:
     from gcs.drive.guard import Guard
@@ -257,3 +257,20 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
             wanted = "wanted that of another ground station"
             raise InputError(f"--mirror: read {text}, which is this station's own, {wanted}")
     return mirror
+
+
+def refuse_headroom(least: float | None) -> None:
+    if least is not None:
+        within("--assert-headroom", least, -1e3, 1.0)
+
+
+def unmet_headroom(found: float | None, least: float) -> str:
+    """What --assert-headroom wanted, in words; empty if the headroom found is enough."""
+    if found is not None and found >= least:
+        return ""
+    read = "no headroom" if found is None else beyond(100.0 * found, 100.0 * least, 1) + "%"
+    return f"--assert-headroom: read {read}, wanted at least {least:.1%}"
+
+
+def say_failed(failure: str) -> None:
+    print(f"failed: {failure}", file=sys.stderr)

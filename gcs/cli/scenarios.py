@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from gcs.cli import FAILED, options
 from gcs.cli import front as fronts
-from gcs.cli import options
 from gcs.cli.front import chosen_for
 from gcs.errors import InputError
 from scenarios.networks import MOST_VEHICLES
@@ -102,23 +102,36 @@ def check(
     links_of: fronts.LinksOf = None,
     allow_unstable: options.AllowUnstable = False,
     allow_code: options.AllowCode = False,
+    assert_headroom: Annotated[
+        float | None,
+        typer.Option(metavar="FRACTION", help="exit with code 1 if less headroom is to be expected over the links"),
+    ] = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Check a scenario before a flight: its keys, design and start.
 
-    Exit code 2 if `gcs fly` would refuse it.
+    Exit code 2 if `gcs fly` would refuse it. --assert-headroom means the headroom that 99 % of the set-points keep;
+    with prediction or loops on board the expected one.
     """
     from gcs.drive import preflight
     from gcs.drive.check import check as checked
     from gcs.plan.planner import flight_plan
 
+    options.refuse_headroom(assert_headroom)
     scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
-    options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
+    options.refuse(scenario_file, preflight.bad_start(scenario))
+    options.refuse(scenario_file, preflight.endless_link(scenario), in_file=links is None)
     scenario, measured = chosen_for(scenario, links_of)
     design, plan = flight_plan(scenario, measured)
     if (unstable := preflight.unstable_loop(plan)) is not None:
         options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    options.answer(checked(plan), partial(_print_check, design), as_json=as_json)
+    found = checked(plan)
+    options.answer(found, partial(_print_check, design), as_json=as_json)
+    if assert_headroom is not None:
+        left = found.headroom if found.headroom_p99 is None else found.headroom_p99
+        if unmet := options.unmet_headroom(left, assert_headroom):
+            options.say_failed(unmet)
+            raise typer.Exit(FAILED)
 
 
 def _print_check(design: "Design", found: "ScenarioCheck") -> None:

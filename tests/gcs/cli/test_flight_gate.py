@@ -70,3 +70,20 @@ def test_what_no_flight_can_show_is_refused_before_it(
     assert wanted in err
     assert err.count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_a_check_is_a_gate_on_the_expected_headroom(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """chain3 has a margin of 300 ms and 60 ms of loop delay at most, over links of 20 ms each way: 80 %."""
+
+    def checked(least: str) -> int | str | None:
+        monkeypatch.setattr("sys.argv", ["gcs", "check", "chain3", "--json", "--assert-headroom", least])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code
+
+    assert [checked("0.8"), checked("0.82"), checked("2")] == [0, 1, 2]
+    failed, refused = capfd.readouterr().err.splitlines()
+    assert failed == "failed: --assert-headroom: read 80.1%, wanted at least 82.0%"
+    assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"
