@@ -11,12 +11,14 @@ import os
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar, get_args, get_type_hints
+from types import FunctionType
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
+P = ParamSpec("P")
 Record = Any
 """In a kernel, one record of a structured array: its fields are attributes, and changes reach the array."""
 Records = Any
@@ -39,6 +41,22 @@ def array_kernel(function: F) -> F:
     """The same of a function that makes arrays, or calls one that returns new ones."""
     compiled: Any = _Kernel(function, makes_arrays=True)
     return compiled
+
+
+def at_row(run: Callable[Concatenate[Record, P], T]) -> Callable[Concatenate[Records, int, P], T]:
+    """A kernel as Python calls it: with an array of records and a row in place of the record that it works on."""
+    inner: Any = run
+    outer = FunctionType(_at_row.__code__, {"_run": run}, "_at_row")
+    outer.__module__, _, name = inner._name.rpartition(".")
+    outer.__qualname__ = f"{name}_at"
+    return kernel(outer)
+
+
+_run: Any = None
+
+
+def _at_row(records: Records, row: int, *rest: Any) -> Any:
+    return _run(records[row], *rest)
 
 
 class _Kernel:

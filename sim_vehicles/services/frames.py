@@ -115,7 +115,7 @@ def _put_float(frame: Frame, at: int, value: float) -> None:
 
 
 @kernel
-def finish(frame: Frame, vehicle: Record, extra: int) -> int:
+def finish(vehicle: Record, frame: Frame, extra: int) -> int:
     """Complete a vehicle's next frame that has its message id and its whole payload, whose size is in place.
 
     Returns the size of the frame.
@@ -134,14 +134,14 @@ def finish(frame: Frame, vehicle: Record, extra: int) -> int:
 
 
 @kernel
-def _finish(frame: Frame, vehicle: Record) -> int:
+def _finish(vehicle: Record, frame: Frame) -> int:
     """Complete the frame of a frequent message."""
-    return finish(frame, vehicle, _EXTRAS[int(frame[7])])
+    return finish(vehicle, frame, _EXTRAS[int(frame[7])])
 
 
 @kernel
 def local_position(
-    frame: Frame, vehicle: Record, boot_ms: int, north: float, east: float, down: float,
+    vehicle: Record, frame: Frame, boot_ms: int, north: float, east: float, down: float,
     v_north: float, v_east: float, v_down: float,
 ) -> int:  # fmt: skip
     """Make a LOCAL_POSITION_NED in m and m/s; returns its size."""
@@ -153,12 +153,12 @@ def local_position(
     _put_float(frame, PAYLOAD + 20, v_east)
     _put_float(frame, PAYLOAD + 24, v_down)
     frame[1], frame[7] = 28, LOCAL_POSITION
-    return _finish(frame, vehicle)
+    return _finish(vehicle, frame)
 
 
 @kernel
 def global_position(
-    frame: Frame, vehicle: Record, boot_ms: int, latitude_deg: float, longitude_deg: float, altitude_m: float,
+    vehicle: Record, frame: Frame, boot_ms: int, latitude_deg: float, longitude_deg: float, altitude_m: float,
     v_north: float, v_east: float, v_down: float, yaw_rad: float,
 ) -> int:  # fmt: skip
     """Make a GLOBAL_POSITION_INT; returns its size. A value that does not fit its field is clipped."""
@@ -172,7 +172,7 @@ def global_position(
     _put_int(frame, PAYLOAD + 24, 2, clipped(v_down * 1e2, INT16))
     _put_int(frame, PAYLOAD + 26, 2, round(math.degrees(yaw_rad) % 360.0 * 1e2) % 36_000)
     frame[1], frame[7] = 28, GLOBAL_POSITION
-    return _finish(frame, vehicle)
+    return _finish(vehicle, frame)
 
 
 @kernel
@@ -183,7 +183,7 @@ def clipped(value: float, largest: int) -> int:
 
 @kernel
 def heartbeat(
-    frame: Frame, vehicle: Record, mode: int, autopilot: int, armed: bool, guided: bool, flying: bool, critical: bool
+    vehicle: Record, frame: Frame, mode: int, autopilot: int, armed: bool, guided: bool, flying: bool, critical: bool
 ) -> int:
     """Make a HEARTBEAT of a quadrotor; returns its size."""
     _put_int(frame, PAYLOAD + 0, 4, mode)
@@ -192,13 +192,13 @@ def heartbeat(
     frame[PAYLOAD + 7] = _CRITICAL if critical else _ACTIVE if flying else _STANDBY
     frame[PAYLOAD + 8] = _VERSION
     frame[1], frame[7] = 9, HEARTBEAT
-    return _finish(frame, vehicle)
+    return _finish(vehicle, frame)
 
 
 @kernel
-def timesync(frame: Frame, vehicle: Record, tc1: int, ts1: int) -> int:
+def timesync(vehicle: Record, frame: Frame, tc1: int, ts1: int) -> int:
     """Make a TIMESYNC, a request if tc1 is 0; returns its size."""
     _put_int(frame, PAYLOAD + 0, 8, tc1)
     _put_int(frame, PAYLOAD + 8, 8, ts1)
     frame[1], frame[7] = 16, TIMESYNC
-    return _finish(frame, vehicle)
+    return _finish(vehicle, frame)

@@ -13,14 +13,13 @@ import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.kernel import Cell, Records, kernel
+from scenarios.kernel import Cell, at_row
 from scenarios.networks import wire_id
 from sim_vehicles.services.frames import (
     ARDUPILOT,
     FRAME_BYTES,
     NO_MESSAGE,
     PAYLOAD,
-    Frame,
     finish,
     global_position,
     heartbeat,
@@ -224,40 +223,8 @@ def _command(frame: bytes) -> Command:
     return Command((frame[5], frame[6]), *target, asked.command, asked.param1, asked.param2, asked.param3, *last)
 
 
-@kernel
-def _local_position_at(
-    vehicles: Records, row: int, frame: Frame, boot_ms: int, north: float, east: float, down: float,
-    v_north: float, v_east: float, v_down: float,
-) -> int:  # fmt: skip
-    return local_position(frame, vehicles[row], boot_ms, north, east, down, v_north, v_east, v_down)
-
-
-@kernel
-def _global_position_at(
-    vehicles: Records, row: int, frame: Frame, boot_ms: int, latitude_deg: float, longitude_deg: float,
-    altitude_m: float, v_north: float, v_east: float, v_down: float, yaw_rad: float,
-) -> int:  # fmt: skip
-    return global_position(
-        frame, vehicles[row], boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, v_down, yaw_rad
-    )
-
-
-@kernel
-def _heartbeat_at(
-    vehicles: Records, row: int, frame: Frame, mode: int, autopilot: int,
-    armed: bool, guided: bool, flying: bool, critical: bool,
-) -> int:  # fmt: skip
-    return heartbeat(frame, vehicles[row], mode, autopilot, armed, guided, flying, critical)
-
-
-@kernel
-def _timesync_at(vehicles: Records, row: int, frame: Frame, tc1: int, ts1: int) -> int:
-    return timesync(frame, vehicles[row], tc1, ts1)
-
-
-@kernel
-def _finish_at(vehicles: Records, row: int, frame: Frame, extra: int) -> int:
-    return finish(frame, vehicles[row], extra)
+_local_position_at, _global_position_at = at_row(local_position), at_row(global_position)
+_heartbeat_at, _timesync_at, _finish_at = at_row(heartbeat), at_row(timesync), at_row(finish)
 
 
 class Encoder:

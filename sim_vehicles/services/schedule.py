@@ -8,7 +8,7 @@ The reports of `REPORTS` are scheduled in the vehicle's record, all other messag
 
 import heapq
 
-from scenarios.kernel import Cell, Record, Records, kernel
+from scenarios.kernel import Cell, Record, at_row, kernel
 from sim_vehicles.services.clock import NEVER_NS, NS_PER_MS, BootClock, host_ns
 from sim_vehicles.services.hot import REPORTS, Place
 
@@ -39,9 +39,7 @@ def schedule_report(vehicle: Record, k: int, number: int) -> None:
     vehicle.report_ns = vehicle.due_ns[vehicle.report]
 
 
-@kernel
-def _schedule_report_at(vehicles: Records, row: int, k: int, number: int) -> None:
-    schedule_report(vehicles[row], k, number)
+_schedule_report_at = at_row(schedule_report)
 
 
 class Schedule:

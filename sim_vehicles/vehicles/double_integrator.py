@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from scenarios import schema
-from scenarios.kernel import Cell, Records, kernel
+from scenarios.kernel import Cell, at_row
 from scenarios.keys.own import aircraft_of, names_code
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
@@ -68,34 +68,9 @@ LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
 
 
-@kernel
-def _state_at(vehicles: Records, row: int) -> State:
-    return state_of(vehicles[row])
-
-
-@kernel
-def _set_state_at(vehicles: Records, row: int, state: State) -> None:
-    set_state(vehicles[row], state)
-
-
-@kernel
-def _command_at(vehicles: Records, row: int) -> Command:
-    return command_of(vehicles[row])
-
-
-@kernel
-def _set_command_at(vehicles: Records, row: int, command: Command) -> None:
-    set_command(vehicles[row], command)
-
-
-@kernel
-def _push_on_at(vehicles: Records, row: int, piece: tuple[float, float, float, float, float]) -> None:
-    push_on(vehicles[row], piece)
-
-
-@kernel
-def _advance_to_at(vehicles: Records, row: int, time_ns: int) -> None:
-    advance_to(vehicles[row], time_ns)
+_state_at, _set_state_at = at_row(state_of), at_row(set_state)
+_command_at, _set_command_at = at_row(command_of), at_row(set_command)
+_push_on_at, _advance_to_at = at_row(push_on), at_row(advance_to)
 
 
 class DoubleIntegrator:

@@ -9,7 +9,7 @@ on the launcher ──first set-point or take-off, armed, GUIDED──► flying
 LOITER and BRAKE both hold the course: ground stations send either for "hold".
 """
 
-from scenarios.kernel import Cell, Record, Records, kernel
+from scenarios.kernel import Cell, Record, at_row, kernel
 from scenarios.schema import NS_PER_S, Safety
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.hot import Place
@@ -53,19 +53,8 @@ def set_deadline(vehicle: Record) -> None:
         vehicle.deadline_ns = min(vehicle.deadline_ns, vehicle.setpoint_ns + vehicle.setpoint_timeout_ns)
 
 
-@kernel
-def _note_setpoint_at(vehicles: Records, row: int, now_ns: int) -> None:
-    note_setpoint(vehicles[row], now_ns)
-
-
-@kernel
-def _note_heartbeat_at(vehicles: Records, row: int, now_ns: int) -> None:
-    note_heartbeat(vehicles[row], now_ns)
-
-
-@kernel
-def _set_deadline_at(vehicles: Records, row: int) -> None:
-    set_deadline(vehicles[row])
+_note_setpoint_at, _note_heartbeat_at = at_row(note_setpoint), at_row(note_heartbeat)
+_set_deadline_at = at_row(set_deadline)
 
 
 class FlightMode:

@@ -123,7 +123,7 @@ def _take_timesync(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -
         return SILENT
     tc1 = boot_ns(vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb, time_ns)
     vehicle.timesync_requests += 1
-    return timesync(answer, vehicle, tc1 or 1, ts1)  # never 0, even at boot: that would make the reply a request
+    return timesync(vehicle, answer, tc1 or 1, ts1)  # never 0, even at boot: that would make the reply a request
 
 
 @kernel
@@ -142,18 +142,18 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     if REPORTS[k] == TIMESYNC:
         clock = vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb
         vehicle.asked_ts1 = boot_ns(clock[0], clock[1], clock[2], time_ns)
-        return timesync(frame, vehicle, 0, vehicle.asked_ts1)
+        return timesync(vehicle, frame, 0, vehicle.asked_ts1)
     if REPORTS[k] == HEARTBEAT:
         mode, critical = vehicle.mode, vehicle.stopped != 0
-        return heartbeat(frame, vehicle, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
+        return heartbeat(vehicle, frame, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
     v_north, v_east = vehicle.speed_m_s * cos(yaw), vehicle.speed_m_s * sin(yaw)
     if REPORTS[k] == LOCAL_POSITION:
         note(truth, SAMPLED, vehicle.system_id, boot_ms & UINT32, time_ns, time_ns, time_ns, PASSED, 0)
-        return local_position(frame, vehicle, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
+        return local_position(vehicle, frame, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
     latitude_deg, longitude_deg = degrees(north, east)
     altitude_m = ORIGIN_ALTITUDE_M + vehicle.altitude_m
     return global_position(
-        frame, vehicle, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, heading
+        vehicle, frame, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, heading
     )  # fmt: skip
 
 
