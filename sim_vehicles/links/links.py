@@ -23,6 +23,8 @@ from sim_vehicles.services.draws import Use, seeds_of
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.mavlink import message_id
 
+_BEHAVIOUR = "least_delay_ns", "reordering", "to_bad", "to_good", "loss_good", "loss_bad", "duplicate", "corrupt"
+"""The fields of a `LinkBehaviour` that kernels read from the link's row."""
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
@@ -124,17 +126,7 @@ class Link:
         self._delay_ns = own.points_ns[0][1]
         values = {"capacity": capacity, "random": self._stream is not None, "delay_ns": self._delay_ns}
         values |= {"kind": kind, "system_id": system_id, "plain": channel is None and not own.timed}
-        for name in (
-            "least_delay_ns",
-            "reordering",
-            "to_bad",
-            "to_good",
-            "loss_good",
-            "loss_bad",
-            "duplicate",
-            "corrupt",
-        ):
-            values[name] = getattr(own, name)
+        values |= {name: getattr(own, name) for name in _BEHAVIOUR}
         for name, value in values.items():
             self._columns[name][row] = value
 

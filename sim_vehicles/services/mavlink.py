@@ -15,17 +15,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Cell, at_row
 from scenarios.networks import wire_id
-from sim_vehicles.services.frames import (
-    ARDUPILOT,
-    FRAME_BYTES,
-    NO_MESSAGE,
-    PAYLOAD,
-    finish,
-    global_position,
-    heartbeat,
-    local_position,
-    timesync,
-)
+from sim_vehicles.services import frames
+from sim_vehicles.services.frames import ARDUPILOT, NO_MESSAGE
 from sim_vehicles.services.hot import Place
 from sim_vehicles.services.messages import REQUESTS, Condition, Message, Request
 
@@ -223,8 +214,8 @@ def _command(frame: bytes) -> Command:
     return Command((frame[5], frame[6]), *target, asked.command, asked.param1, asked.param2, asked.param3, *last)
 
 
-_local_position_at, _global_position_at = at_row(local_position), at_row(global_position)
-_heartbeat_at, _timesync_at, _finish_at = at_row(heartbeat), at_row(timesync), at_row(finish)
+_local_position_at, _global_position_at = at_row(frames.local_position), at_row(frames.global_position)
+_heartbeat_at, _timesync_at, _finish_at = at_row(frames.heartbeat), at_row(frames.timesync), at_row(frames.finish)
 
 
 class Encoder:
@@ -236,7 +227,7 @@ class Encoder:
         self._vehicles, self._columns, self._row = place
         self.wire_id: int = self._columns["wire_id"][self._row]
         self._pymavlink = dialect.MAVLink(None, srcSystem=self.wire_id, srcComponent=COMPONENT_AUTOPILOT)
-        self._frame = np.zeros(FRAME_BYTES, np.uint8)
+        self._frame = np.zeros(frames.FRAME_BYTES, np.uint8)
 
     def local_position(self, time_boot_ms: int, position: Triple, velocity: Triple) -> bytes:
         """LOCAL_POSITION_NED in m and m/s."""
@@ -253,14 +244,7 @@ class Encoder:
         return self._frame[:size].tobytes()
 
     def heartbeat(
-        self,
-        mode: int,
-        *,
-        armed: bool,
-        flying: bool,
-        critical: bool,
-        guided: bool = False,
-        autopilot: int = ARDUPILOT,
+        self, mode: int, *, armed: bool, flying: bool, critical: bool, guided: bool = False, autopilot: int = ARDUPILOT
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
         size = _heartbeat_at(self._vehicles, self._row, self._frame, mode, autopilot, armed, guided, flying, critical)
@@ -284,7 +268,7 @@ class Encoder:
 
     def frame(self, number: int, payload: bytes) -> bytes:
         """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
-        self._frame[PAYLOAD : PAYLOAD + len(payload)] = np.frombuffer(payload, np.uint8)
+        self._frame[frames.PAYLOAD : frames.PAYLOAD + len(payload)] = np.frombuffer(payload, np.uint8)
         self._frame[1], self._frame[7] = len(payload), number
         size = _finish_at(self._vehicles, self._row, self._frame, CRC_EXTRA[number][0])
         return self._frame[:size].tobytes()

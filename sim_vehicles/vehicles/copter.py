@@ -23,15 +23,7 @@ from sim_vehicles.services.clock import NEVER_NS, BootClock
 from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.sitl import slips
-from sim_vehicles.vehicles.copter_rules import (
-    FAILED,
-    PX4_TAKEOFF_ALTITUDE,
-    RULES,
-    TEMPORARILY_REJECTED,
-    commanded_mode,
-    parameters,
-    setpoint_target,
-)
+from sim_vehicles.vehicles import copter_rules
 from sim_vehicles.vehicles.setpoints import ABSURD, POSITION_AXES, VELOCITY_AXES, YAW_IGNORED, YAW_RATE_IGNORED
 from sim_vehicles.vehicles.shell import Answer, Radio
 
@@ -57,10 +49,10 @@ class Copter:
     def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
         start_ns = radio.start_ns
         self.settings = scenario.autopilot
-        self.rules = RULES[own.flavour or scenario.autopilot.flavour]
+        self.rules = copter_rules.RULES[own.flavour or scenario.autopilot.flavour]
         self.version, self.version_1_first = self.rules.version, self.rules.version_1_first
         self.is_plain = False
-        self.parameters = parameters(self.rules, own.system_id, self.settings)
+        self.parameters = copter_rules.parameters(self.rules, own.system_id, self.settings)
         self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self.mode = self.rules.first_mode
@@ -155,7 +147,9 @@ class Copter:
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
         """Fly a set-point from now on, if in guided mode and off the ground."""
         gain = self.settings.velocity_gain_1_s
-        reason, target = setpoint_target(setpoint, self.rules, yaw_rad=self.motion.yaw_rad, velocity_gain_1_s=gain)
+        reason, target = copter_rules.setpoint_target(
+            setpoint, self.rules, yaw_rad=self.motion.yaw_rad, velocity_gain_1_s=gain
+        )
         guided = self.mode == self.rules.guided_mode
         if reason:
             if guided and self.rules.velocity_grows and not self.landed:
@@ -189,7 +183,7 @@ class Copter:
             case mavlink.COMMAND_ARM:
                 return self._arm(command, time_ns)
             case mavlink.COMMAND_MODE:
-                return self.change_mode(commanded_mode(command, self.rules), time_ns)
+                return self.change_mode(copter_rules.commanded_mode(command, self.rules), time_ns)
             case mavlink.COMMAND_TAKEOFF:
                 return self._take_off(command, time_ns), ""
             case mavlink.COMMAND_LAND | mavlink.COMMAND_RETURN as asked:
@@ -204,7 +198,7 @@ class Copter:
     def _arm(self, command: mavlink.Command, time_ns: int) -> Answer:
         if command.param1 == 0.0:
             if not self.landed:
-                return FAILED, ""
+                return copter_rules.FAILED, ""
             self.armed = False
             return _ACCEPTED
         if self.armed:
@@ -230,7 +224,7 @@ class Copter:
             return self.rules.arming_refused, ""  # these modes need a position
         streamed = self._setpoint_ns is not None and time_ns - self._setpoint_ns < self._setpoint_timeout_ns
         if mode == self.rules.guided_mode != self.rules.takeoff_mode and not streamed:
-            return TEMPORARILY_REJECTED, "Offboard needs set-points"
+            return copter_rules.TEMPORARILY_REJECTED, "Offboard needs set-points"
         self.mode, self.failsafe, self._takeoff_m = mode, False, None
         self._target = self._stopped()
         if mode == self.rules.guided_mode == self.rules.takeoff_mode:
@@ -243,13 +237,13 @@ class Copter:
         own_mode = self.rules.takeoff_mode == self.rules.guided_mode
         altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
         if not own_mode and math.isnan(altitude_m):
-            altitude_m = self.parameters[PX4_TAKEOFF_ALTITUDE]
+            altitude_m = self.parameters[copter_rules.PX4_TAKEOFF_ALTITUDE]
         if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
-            return FAILED
+            return copter_rules.FAILED
         if not own_mode and math.isfinite(command.param5 + command.param6):
             return mavlink.DENIED  # a take-off towards a latitude and longitude is not simulated
         if not (self.landed and self._ready(time_ns) and 0.0 < altitude_m < ABSURD):
-            return FAILED if own_mode else TEMPORARILY_REJECTED
+            return copter_rules.FAILED if own_mode else copter_rules.TEMPORARILY_REJECTED
         self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
         if self.armed:
             self._leave_ground(time_ns)

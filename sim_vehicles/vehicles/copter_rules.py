@@ -13,18 +13,7 @@ from sim_vehicles.motion.copter import Target
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.mavlink import Command, Setpoint
 from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, limit, timeout
-from sim_vehicles.vehicles.setpoints import (
-    ABSURD,
-    ACCELERATION_AXES,
-    BODY_FRAMES,
-    FORCE_SET,
-    LOCAL_FRAMES,
-    POSITION_AXES,
-    VELOCITY_AXES,
-    YAW_IGNORED,
-    YAW_RATE_IGNORED,
-    to_local,
-)
+from sim_vehicles.vehicles import setpoints
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
@@ -148,12 +137,12 @@ def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]
     One ignored axis drops all three of its vector. A refused set-point makes ArduCopter stop; PX4 ignores it.
     """
     mask = setpoint.type_mask
-    velocity, acceleration = not mask & VELOCITY_AXES, not mask & ACCELERATION_AXES
-    if setpoint.frame not in LOCAL_FRAMES and setpoint.frame not in BODY_FRAMES:
+    velocity, acceleration = not mask & setpoints.VELOCITY_AXES, not mask & setpoints.ACCELERATION_AXES
+    if setpoint.frame not in setpoints.LOCAL_FRAMES and setpoint.frame not in setpoints.BODY_FRAMES:
         return "refused_frame", False, False
-    if mask & FORCE_SET and (acceleration or rules is PX4):
+    if mask & setpoints.FORCE_SET and (acceleration or rules is PX4):
         return "refused_force", False, False
-    if not mask & POSITION_AXES or not (velocity or acceleration):
+    if not mask & setpoints.POSITION_AXES or not (velocity or acceleration):
         return "refused_mask", False, False  # flying to positions is not simulated
     return "", velocity, acceleration
 
@@ -166,12 +155,12 @@ def setpoint_target(
     Ignored fields may hold anything, even NaN, which some clients send.
     """
     reason, velocity_counts, acceleration_counts = setpoint_meaning(setpoint, rules)
-    setpoint = to_local(setpoint, yaw_rad)
+    setpoint = setpoints.to_local(setpoint, yaw_rad)
     acceleration = setpoint.acceleration_ned_m_s2 if acceleration_counts else (0.0, 0.0, 0.0)
     velocity = setpoint.velocity_ned_m_s if velocity_counts else (0.0, 0.0, 0.0)
-    yaw = None if setpoint.type_mask & YAW_IGNORED else setpoint.yaw_rad
-    rate = 0.0 if setpoint.type_mask & YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
-    if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= ABSURD:
+    yaw = None if setpoint.type_mask & setpoints.YAW_IGNORED else setpoint.yaw_rad
+    rate = 0.0 if setpoint.type_mask & setpoints.YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
+    if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= setpoints.ABSURD:
         return "refused_absurd", Target()
     return reason, Target(
         *acceleration[:2],

@@ -12,55 +12,26 @@ from scenarios.kernel import Cell, at_row
 from scenarios.keys.own import aircraft_of, names_code
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
+from sim_vehicles.motion import double_integrator as motion
 from sim_vehicles.motion.air import Air, Push, air_of
 from sim_vehicles.motion.aircraft import Aircraft, Attitude
-from sim_vehicles.motion.double_integrator import (
-    COAST,
-    VELOCITY_GAIN_1_S,
-    Bounds,
-    Command,
-    State,
-    advance,
-    advance_to,
-    bounds_of,
-    command_of,
-    limited,
-    push_on,
-    pushed,
-    rates,
-    set_command,
-    set_state,
-    shifted,
-    state_from,
-    state_of,
-)
+from sim_vehicles.motion.double_integrator import COAST, VELOCITY_GAIN_1_S, Bounds, Command, State
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.motion.own import OwnMotion
 from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
 from sim_vehicles.services.services import whole
+from sim_vehicles.vehicles import setpoints
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
 from sim_vehicles.vehicles.hold import Hold
 from sim_vehicles.vehicles.onboard import STEP, VehicleLoop, formation_parameters
-from sim_vehicles.vehicles.setpoints import (
-    ACCELERATION,
-    AXES,
-    POSITION_AXES,
-    VELOCITY,
-    VELOCITY_ACCELERATION,
-    VELOCITY_AXES,
-    YAW_IGNORED,
-    YAW_RATE_IGNORED,
-    fault,
-    to_local,
-)
 from sim_vehicles.vehicles.shell import Answer, Radio
 
 CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the course"
 """Also sent as STATUSTEXT: a person who asks for this may not see the result code."""
 
-_ACCELERATION_ONLY = POSITION_AXES | VELOCITY_AXES | YAW_IGNORED | YAW_RATE_IGNORED
+_ACCELERATION_ONLY = setpoints.ACCELERATION | setpoints.YAW_IGNORED | setpoints.YAW_RATE_IGNORED
 
 
 Step = Callable[[State, Command, Bounds, float], State]
@@ -68,9 +39,9 @@ LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
 
 
-_state_at, _set_state_at = at_row(state_of), at_row(set_state)
-_command_at, _set_command_at = at_row(command_of), at_row(set_command)
-_push_on_at, _advance_to_at = at_row(push_on), at_row(advance_to)
+_state_at, _set_state_at = at_row(motion.state_of), at_row(motion.set_state)
+_command_at, _set_command_at = at_row(motion.command_of), at_row(motion.set_command)
+_push_on_at, _advance_to_at = at_row(motion.push_on), at_row(motion.advance_to)
 
 
 class DoubleIntegrator:
@@ -106,11 +77,11 @@ class DoubleIntegrator:
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
-        self._bounds = bounds_of(scenario.limits)
+        self._bounds = motion.bounds_of(scenario.limits)
         for name, bound in self._bounds._asdict().items():
             self._columns[name][self._row] = bound
         self._altitude_m = scenario.altitude_of(own)
-        self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
+        self._state = motion.state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
         self._air = air_of(scenario, own.system_id, radio.start_ns, radio.recorder)
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
@@ -153,12 +124,12 @@ class DoubleIntegrator:
         if not self.flight.flying or time_ns <= self._state_ns:
             return self._state
         if self._air is None:
-            return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+            return motion.advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
         if self._own is not None:
             return self._own_motion(self._own.foreseen, self._air, time_ns, foreseen=True)
         state = self._state
         for piece in self._air.pieces(self._state_ns, time_ns, foreseen=True):
-            state = pushed(state, self._command, self._bounds, piece)
+            state = motion.pushed(state, self._command, self._bounds, piece)
         return state
 
     def acts_at(self, time_ns: int) -> int:
@@ -180,10 +151,10 @@ class DoubleIntegrator:
     def _fly(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
         """Fly a set-point from now on, if it is valid and allowed; the first one begins the flight."""
         on_launcher = not self.flight.flying
-        counts = setpoint.type_mask & AXES
+        counts = setpoint.type_mask & setpoints.AXES
         onboard = self._onboard if self._onboard is not None and self._onboard.on else None
-        reason = fault(setpoint)
-        if onboard is not None and counts != VELOCITY_ACCELERATION:
+        reason = setpoints.fault(setpoint)
+        if onboard is not None and counts != setpoints.VELOCITY_ACCELERATION:
             reason = reason or "refused_mask"  # the loop on board needs the formation's velocity
         reason = reason or self.flight.accept_setpoint(time_ns)
         if reason:
@@ -193,14 +164,14 @@ class DoubleIntegrator:
             self._radio.tell(time_ns, "flying")
         self.move(time_ns)
         if setpoint.frame != mavlink.FRAME_LOCAL_NED:
-            setpoint = to_local(setpoint, self._state.yaw_rad)
+            setpoint = setpoints.to_local(setpoint, self._state.yaw_rad)
         north, east, _ = setpoint.acceleration_ned_m_s2
         if onboard is not None:
             onboard.stream(setpoint.velocity_ned_m_s[:2], (north, east))
             self._command = onboard.command()
-        elif counts == ACCELERATION:
+        elif counts == setpoints.ACCELERATION:
             self._command = Command(north, east)
-        elif counts == VELOCITY:
+        elif counts == setpoints.VELOCITY:
             self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
         else:
             self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
@@ -337,7 +308,7 @@ class DoubleIntegrator:
         flight = self.flight
         if not flight.flying or flight.mode != mavlink.MODE_GUIDED or flight.failsafe:
             return None
-        followed = limited(self._state, self._command, self._bounds)
+        followed = motion.limited(self._state, self._command, self._bounds)
         return self._radio.encoder.pack(
             messages.position_target(boot_ms, _ACCELERATION_ONLY, (0.0, 0.0, 0.0), followed)
         )
@@ -348,7 +319,7 @@ class DoubleIntegrator:
             return self._aircraft.attitude()
         state, roll_rad = self._state, 0.0
         if self.flight.flying:
-            _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
+            _, _, turn_rate_rad_s, _ = motion.rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
             roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
         return Attitude(0.0, 0.0, roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau))
 
@@ -389,7 +360,7 @@ class DoubleIntegrator:
         def move(state: State, duration_s: float) -> State:
             return moved(state, command, self._bounds, duration_s)
 
-        return air.moved(self._state, move, shifted, self._state_ns, time_ns, foreseen=foreseen)
+        return air.moved(self._state, move, motion.shifted, self._state_ns, time_ns, foreseen=foreseen)
 
     def _note_fault(self, text: str) -> None:
         """Count a step in which the user's own dynamics failed, and report the first."""
