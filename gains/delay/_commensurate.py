@@ -32,14 +32,7 @@ from gains.delay._crossings import (
     polish,
     separating_points,
 )
-from gains.delay._loci import (
-    Loci,
-    UnitCrossing,
-    highest_frequency,
-    solved_beside_poles,
-    unit_crossings,
-    with_extrema,
-)
+from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings, with_extrema
 from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
 from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, without_zero, zero_passage
 

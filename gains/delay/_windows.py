@@ -139,11 +139,7 @@ def _windows(
 
 
 def block_analysis(
-    copies: int,
-    terms: Sequence[DelayedTerm],
-    found: Sequence[Crossing],
-    unstable: int,
-    passage: ZeroPassage | None,
+    copies: int, terms: Sequence[DelayedTerm], found: Sequence[Crossing], unstable: int, passage: ZeroPassage | None
 ) -> BlockAnalysis:
     """One block's analysis from its crossings, without those seen of `passage`, and its unstable roots without delay.
 

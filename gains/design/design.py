@@ -171,12 +171,7 @@ def evaluate_gains(
 
 
 def evaluate_gains(
-    formation: FormationModel,
-    gains: Any,
-    *,
-    period_s: float,
-    pattern: Pattern | None = None,
-    feed_forward: float = 0.0,
+    formation: FormationModel, gains: Any, *, period_s: float, pattern: Pattern | None = None, feed_forward: float = 0.0
 ) -> Design | GraphDesign:
     """Return margins, robustness and decay of given gains.
 

@@ -66,7 +66,10 @@ class Pattern:
     """Length of every u_i and y_j; they may differ from vehicle to vehicle."""
 
     def __post_init__(self) -> None:
-        blocks = _checked_blocks(self.blocks)
+        matrix = real_matrix("blocks", self.blocks)
+        if not np.isin(matrix, (0.0, 1.0)).all():
+            raise BadModelError("blocks has entries other than 0 and 1; a binary matrix is wanted")
+        blocks = matrix.astype(bool)
         for name, wanted in zip(("input_sizes", "output_sizes"), blocks.shape, strict=True):
             sizes = tuple(getattr(self, name))
             if len(sizes) != wanted:
@@ -218,13 +221,6 @@ def check_fits(plant: Plant, pattern: Pattern) -> None:
 def _formation_sizes(formation: FormationModel) -> tuple[tuple[int, ...], tuple[int, ...]]:
     n, vehicles = formation.axes, formation.vehicles
     return (n,) * vehicles, (n,) + (2 * n,) * (vehicles - 1)
-
-
-def _checked_blocks(blocks: ArrayLike) -> BoolArray:
-    matrix = real_matrix("blocks", blocks)
-    if not np.isin(matrix, (0.0, 1.0)).all():
-        raise BadModelError("blocks has entries other than 0 and 1; a binary matrix is wanted")
-    return matrix.astype(bool)
 
 
 def _set(pattern: Pattern, links: Iterable[Link], value: bool) -> BoolArray:

@@ -19,12 +19,7 @@ from gains.sampled._carried import CarriedStates, carried_states
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
-from gains.sampled.prediction import (
-    checked_mask,
-    mismatch_window,
-    mismatch_window_continuous,
-    predicted_growth_rate,
-)
+from gains.sampled.prediction import checked_mask, mismatch_window, mismatch_window_continuous, predicted_growth_rate
 
 
 class ClosedLoop(Protocol):

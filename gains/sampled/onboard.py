@@ -77,7 +77,8 @@ class OnboardTiming:
 class OnboardLoop:
     """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when each part acts.
 
-    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others.
+    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others. Methods
+    without a docstring are those of `gains.sampled.coupled_block.ClosedLoop`.
     """
 
     A: FloatArray
@@ -110,20 +111,16 @@ class OnboardLoop:
         return lifted_margin(plants, rates, near_s=continuous_s)
 
     def growth_1_s(self, delay_s: float) -> float:
-        """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
         return lifted_growth(self.plants(), self.timing.rates, delay_s=delay_s)
 
     def window_s(self) -> tuple[float, float]:
-        """From no loop delay (s) to the sampled margin."""
         return 0.0, self.sampled_margin_s()
 
     def window_continuous_s(self) -> tuple[float, float]:
-        """The same of the continuous model; the station's hold counts as half a period."""
         return 0.0, self.continuous_margin_s() - self.timing.rates.held_s / 2.0
 
     def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        """What acts after known delays (s), where a hold counts as half a step, and what acts a loop delay late."""
-        own_s = self.timing.control_s / self.timing.steps / 2.0
+        own_s = self.timing.control_s / self.timing.steps / 2.0  # a hold counts as half a step
         return [(self.A, 0.0), (self.sensed + self.known, own_s)], self.late
 
     def plants(self) -> "list[LocalPlant]":

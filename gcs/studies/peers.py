@@ -76,11 +76,7 @@ class SideBySide(Published):
 
 
 def side_by_side(
-    scenario: Scenario,
-    *,
-    seconds: float,
-    sizes: Sequence[int] = SIZES,
-    ended: Callable[[int], None] = lambda _: None,
+    scenario: Scenario, *, seconds: float, sizes: Sequence[int] = SIZES, ended: Callable[[int], None] = lambda _: None
 ) -> SideBySide:
     """Compare with every peer that is installed; stations fly formations of `sizes` for `seconds` each.
 

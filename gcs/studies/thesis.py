@@ -27,21 +27,8 @@ from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, bidirectional, checked_pattern_gain, formation_plant, leader_follower
 from gains.margin.opinions import checked_delay_margin
 from gains.sampled.onboard import own_part
-from gcs.studies.thesis_flights import (
-    ALPHA,
-    CHAIN,
-    DELAYS_S,
-    PERIOD_S,
-    SINGLE,
-    SPEED_M_S,
-    disturbance_onset,
-    flown,
-    fly_with_late_neighbours,
-    formation_figure,
-    nonlinear_response,
-    printed_gains,
-    responses_figure,
-)
+from gcs.studies import thesis_flights
+from gcs.studies.thesis_flights import ALPHA, CHAIN, DELAYS_S, SINGLE, flown, printed_gains
 from gcs.views.page import rendered
 
 PAGE_FILE = "thesis.md"
@@ -82,7 +69,9 @@ def _modelling() -> Iterator[Claim]:
     start = np.zeros(CHAIN.states)
     start[CHAIN.velocity_slice(0)], start[CHAIN.spacing_slice(1)] = (5.0, -3.0), (20.0, 10.0)
     K = printed_gains()
-    _, flown = fly_with_late_neighbours(CHAIN, K, start, delay_s=0.0, speed_m_s=SPEED_M_S, duration_s=1.0)
+    _, flown = thesis_flights.fly_with_late_neighbours(
+        CHAIN, K, start, delay_s=0.0, speed_m_s=thesis_flights.SPEED_M_S, duration_s=1.0
+    )
     # the same hold of 1 ms in the linear model: one exponential a step
     generator = np.zeros((CHAIN.states + CHAIN.inputs,) * 2)
     generator[: CHAIN.states] = np.hstack([CHAIN.A, CHAIN.B])
@@ -100,7 +89,7 @@ def _modelling() -> Iterator[Claim]:
 
 
 def _inclusion() -> Iterator[Claim]:
-    found = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S)
+    found = design(CHAIN, Requirement(alpha=ALPHA), period_s=thesis_flights.PERIOD_S)
     gains = found.K1, found.K2, found.K3
     K = CHAIN.overlapping_gain(*gains)
     worst = 0.0
@@ -141,7 +130,7 @@ def _inclusion() -> Iterator[Claim]:
 
 
 def _disturbance() -> Iterator[Claim]:
-    delay_s, onset = disturbance_onset()
+    delay_s, onset = thesis_flights.disturbance_onset()
     assert onset.onset_1_s is not None
     yield Claim(
         "(3.20)-(3.24)", "disturbance w: stable under every |w| ≤ α |e| of a follower and the vehicle in front",
@@ -282,7 +271,7 @@ def _delay() -> Iterator[Claim]:
     )  # fmt: skip
     for delay_s in DELAYS_S:
         root = rightmost_root([(A0, 0.0), (A1, delay_s)])
-        rate, settled_s = nonlinear_response(delay_s)
+        rate, settled_s = thesis_flights.nonlinear_response(delay_s)
         if delay_s == DELAYS_S[0]:
             yield Claim(
                 "5.4", "responses at h = 0.17 s", "settle in about 3.5 s",
@@ -388,9 +377,9 @@ def subset_margin_by_sweep(number: int) -> float:
 
 
 def write_page(folder: Path, found: list[Claim]) -> Path:
-    formation_figure(folder / "inclusion.png", "inclusion")
-    formation_figure(folder / "graph.png", "graph-dk")
-    responses_figure(folder / "responses.png")
+    thesis_flights.formation_figure(folder / "inclusion.png", "inclusion")
+    thesis_flights.formation_figure(folder / "graph.png", "graph-dk")
+    thesis_flights.responses_figure(folder / "responses.png")
     page = folder / PAGE_FILE
     page.write_text(rendered("thesis.md.j2", claims=found, alpha=ALPHA) + "\n", encoding="utf-8")
     return page

@@ -30,7 +30,7 @@ from gcs.watch.rebuild_report import found
 from gcs.watch.saved_links import LinkRecorder, recorded
 from gcs.watch.tlog import read_tlog
 from scenarios.keys.part import PREDICTION_MAX_S
-from scenarios.schema import Control, FixedGains, Scenario
+from scenarios.schema import FixedGains, Scenario
 
 OPTION = "--links-of"
 LEAST_SHARE = 0.2
@@ -96,7 +96,10 @@ def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario,
 
 def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, LinkPart]:
     """The scenario with the gains that are best for these delays, and why. Raises InputError if none tolerate them."""
-    aim = _aim(scenario.control)
+    criteria = scenario.control.criteria
+    aim: Aim = "alpha_at_delay"
+    if criteria is not None and criteria.maximise == "decay_rate_1_s":
+        aim = "decay_rate_at_delay_1_s"
     candidates = tuple(_candidate(scenario, delays, aim, predicted=predicted) for predicted in (False, True))
     figure = "alpha" if aim == "alpha_at_delay" else "decay_rate_1_s"
     fit = [own for own in candidates if not own.refused]
@@ -123,11 +126,6 @@ def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, Link
     assert best.K3 is not None
     gains = FixedGains(K1=best.K1, K2=best.K2, K3=best.K3)
     return with_given(scenario, gains=gains, prediction="measured" if best.prediction else "off"), part
-
-
-def _aim(control: Control) -> Aim:
-    decay = control.criteria is not None and control.criteria.maximise == "decay_rate_1_s"
-    return "decay_rate_at_delay_1_s" if decay else "alpha_at_delay"
 
 
 def _name(own: GainsAtDelay) -> str:
