@@ -105,26 +105,12 @@ def fly_virtual(
 ) -> VirtualFlight:
     """Fly a scenario in virtual time: real MAVLink bytes, emulated links, no sockets, no files.
 
-    Parameters
-    ----------
-    scenario
-        A scenario, its file, or the name of one that ships (`gcs scenarios`).
-    allow_unstable
-        Whether to fly gains whose loop is unstable even without delay.
-    allow_code
-        Whether to run the Python code that the scenario names.
+    `scenario` is a scenario, its file, or the name of one that ships (`gcs scenarios`). Gains whose loop is unstable
+    even without delay are flown if `allow_unstable`, and the Python code that a scenario names is run if `allow_code`.
 
-    Raises
-    ------
-    scenarios.errors.ScenarioError
-        If the file is not a scenario.
-    gcs.errors.InputError
-        If `gcs fly` would refuse the scenario.
-    gains.GainsError
-        If its requirement cannot be met.
+    Raises scenarios.errors.ScenarioError if the file is not a scenario, gcs.errors.InputError if `gcs fly` would refuse
+    it, and gains.GainsError if its requirement cannot be met.
 
-    Examples
-    --------
     >>> flight = fly_virtual("chain3")
     >>> flight.summary.verdict, flight.spacing_error_ne_m.shape[1:]
     ('stable', (3, 2))
