@@ -56,7 +56,6 @@ class LoopFigures:
 
     @cached_property
     def closed_loop(self) -> FloatArray:
-        """A + B K."""
         return self.model.A + self.model.B @ self.K
 
     @cached_property

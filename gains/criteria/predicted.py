@@ -100,7 +100,6 @@ class PredictedFigures:
 
     @property
     def exact(self) -> Self:
-        """The same figures, none of them rough."""
         return replace(self, thinned=1)
 
     @cached_property

@@ -243,7 +243,6 @@ class PatternGains:
         return (K / self._units)[self.mask]
 
     def gain(self, point: FloatArray) -> FloatArray:
-        """K of a point."""
         K = np.zeros(self.mask.shape)
         K[self.mask] = point
         return K * self._units

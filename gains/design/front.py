@@ -115,7 +115,6 @@ class FrontSearch:
 
     @cached_property
     def _single(self) -> FormationModel:
-        """The formation of one axis."""
         return FormationModel(self.formation.predecessors, axes=1)
 
     def _family(self, route: Route, delay_s: float) -> tuple[GainFamily, Callable[[FloatArray], FloatArray]]:

@@ -132,7 +132,6 @@ class PredictedTree:
         return found
 
     def figures(self, point: FloatArray) -> PredictedFigures:
-        """The figures of the gains of a point."""
         K, at_s = self.tree.gains(point).K, (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
         return PredictedFigures(
             PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED, self.response
@@ -157,7 +156,6 @@ class PredictedPattern:
         ]
 
     def figures(self, point: FloatArray) -> PredictedFigures:
-        """The figures of the gains of a point."""
         own = self.pattern
         assert own.delay_s is not None
         K, period_s = own.gain(point), own.timing.period_s

@@ -124,7 +124,6 @@ def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
 
 
 def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[complex]:
-    """The fixed modes of one component."""
     at = np.ix_(component.states, component.states)
     fixed: list[complex] = []
     for mode in _candidates(component.A):

@@ -65,7 +65,6 @@ class HeldPlant:
         return exponentials[:, :n, :n], exponentials[:, :n, n:]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """As of the protocol."""
         return self.transition(np.diff(instants))
 
     def carry(self, duration_s: FloatArray) -> FloatArray:

@@ -185,7 +185,6 @@ class _Search:
         return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
 
     def _is_stable(self, delay_s: float) -> bool:
-        """Whether the loop is stable at a true delay."""
         if delay_s not in self.stable:
             self._judge([delay_s])
         return self.stable[delay_s]

@@ -166,7 +166,6 @@ class LocalPlant:
         return whole[:, :n, :n], whole[:, :n, 3 * n :]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """As of the protocol."""
         inside, maps = 3 * len(self.free), list[FloatArray]()
         for begin_s, end_s in pairwise(instants):
             first, last = (ceil(instant / self._step_s - _SAME_INSTANT) for instant in (begin_s, end_s))

@@ -44,7 +44,6 @@ class VelocityTargets:
         self._targets[row] = None
 
     def steers(self, row: int) -> bool:
-        """Whether a vehicle has a velocity target to continue from."""
         return self._targets[row] is not None
 
     def accelerate(

@@ -223,9 +223,8 @@ class _Lines:
 
     def changes(self, changes: list["Change"]) -> None:
         for change in changes:
-            self.line(
-                f"{(change.time_ns - self._start_ns) / NS_PER_S:8.3f} s  vehicle {change.system_id}: {change.text}"
-            )
+            time_s = (change.time_ns - self._start_ns) / NS_PER_S
+            self.line(f"{time_s:8.3f} s  vehicle {change.system_id}: {change.text}")
 
     def lateness(self, sockets: "Sockets") -> None:
         """Report, at most once a second, datagrams that left so late that the links differ from the scenario's."""
@@ -241,9 +240,8 @@ class _Lines:
     def summary(self, counters: Counter[str], log: "TruthLog | None") -> None:
         """Print the last line: the counters."""
         counters += Counter(truth_lost=log.lost if log else 0)
-        self.line(
-            "received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing")
-        )
+        counts = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()))
+        self.line(f"received: {counts or 'nothing'}")
 
 
 @contextlib.contextmanager

@@ -242,7 +242,6 @@ class Fleet:
         return self._leaving.shape[1]
 
     def _leave(self, now_ns: int) -> int:
-        """Let datagrams leave; returns how many."""
         if self._recorder is not None:
             self._recorder.make_room()
         vehicles, links, entries, frames, _, truth = self._arrays()

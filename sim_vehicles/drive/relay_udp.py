@@ -60,7 +60,6 @@ class Peers:
         return received
 
     def send(self, passing: list[Passing]) -> None:
-        """Send what has left the links."""
         sent: list[tuple[bytes, int, int, tuple[str, int] | None]] = []
         for due_ns, kind, system_id, data in passing:
             up = kind == LINK_UP

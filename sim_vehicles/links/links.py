@@ -153,11 +153,9 @@ class Link:
                 begin_ns, end_ns = sending_ns or (time_ns, time_ns)
                 self._barred = PASSED if sending_ns else truth.QUEUE_FULL
         entering = np.frombuffer(data, np.uint8), time_ns, begin_ns, end_ns, delay_ns
-        queues, fate = self._queues, NOT_READY
+        pool, fate = self._queues, NOT_READY
         while fate == NOT_READY:
-            fate = enter_at(
-                queues.links, queues.entries, queues.frames, queues.draws, queues.truth, self._row, *entering
-            )
+            fate = enter_at(pool.links, pool.entries, pool.frames, pool.draws, pool.truth, self._row, *entering)
             if fate == NOT_READY:
                 self.make_ready()
         if len(data) > FRAME_BYTES:

@@ -86,7 +86,6 @@ class Recorder:
         self._write = write
 
     def add(self, row: Row) -> None:
-        """Add one record."""
         self.make_room()
         self._counts[0] = count = self._counts[0] + 1
         self.rows[count] = row if len(row) == 8 else (*row, PASSED, 0)
@@ -117,7 +116,6 @@ class MemoryRecorder(Recorder):
 
     @property
     def records(self) -> Records:
-        """The records so far."""
         self.flush()
         return np.concatenate(self._batches)
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeVar
 
 from scenarios.keys import disturbance
-from scenarios.keys.own import BUILT_IN
 from scenarios.schema import NS_PER_S, Scenario
 from sim_vehicles.links.truth import CARRIED, PUSHED, Recorder, disturbance_row
 from sim_vehicles.services.clock import NEVER_NS
@@ -136,9 +135,3 @@ class Air:
             self._recorder.add(disturbance_row(PUSHED, self._system_id, 0, time_ns, push[0], push[1]))
         if push[2:] != before[2:]:
             self._recorder.add(disturbance_row(CARRIED, self._system_id, 0, time_ns, push[2], push[3]))
-
-
-def air_of(scenario: Scenario, system_id: int, start_ns: int, recorder: Recorder | None) -> Air | None:
-    """What pushes a vehicle; None in still air, unless the scenario names the user's own dynamics."""
-    still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
-    return None if still else Air(scenario, system_id, start_ns, recorder)

@@ -127,11 +127,8 @@ def command_of(vehicle: Record) -> Command:
 @kernel
 def set_command(vehicle: Record, command: Command) -> None:
     vehicle.acceleration_north_m_s2, vehicle.acceleration_east_m_s2 = command[0], command[1]
-    vehicle.velocity_north_m_s, vehicle.velocity_east_m_s, vehicle.velocity_gain_1_s = (
-        command[2],
-        command[3],
-        command[4],
-    )
+    vehicle.velocity_north_m_s, vehicle.velocity_east_m_s = command[2], command[3]
+    vehicle.velocity_gain_1_s = command[4]
 
 
 @kernel
@@ -209,7 +206,6 @@ def limited(state: State, command: Command, bounds: Bounds) -> tuple[float, floa
 
 @kernel
 def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> State:
-    """A Runge-Kutta step with all limits."""
     north, east, yaw, speed = state
     half = 0.5 * h
     n1, e1, w1, a1 = rates(yaw, speed, command, bounds)

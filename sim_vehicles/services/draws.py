@@ -26,5 +26,4 @@ def seeds_of(seed: int, system_id: int, use: Use) -> np.random.SeedSequence:
 
 
 def draws_of(seed: int, system_id: int, use: Use) -> np.random.Generator:
-    """The generator of one stream of a scenario."""
     return np.random.default_rng(seeds_of(seed, system_id, use))

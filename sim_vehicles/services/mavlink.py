@@ -251,7 +251,6 @@ class Encoder:
         return self._frame[:size].tobytes()
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
-        """TIMESYNC, a request if tc1 is 0."""
         size = _timesync_at(self._vehicles, self._row, self._frame, tc1, ts1)
         return self._frame[:size].tobytes()
 

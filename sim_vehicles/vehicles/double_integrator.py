@@ -9,11 +9,11 @@ from collections.abc import Callable, Mapping
 
 from scenarios import schema
 from scenarios.kernel import Cell, at_row
-from scenarios.keys.own import aircraft_of, names_code
+from scenarios.keys.own import BUILT_IN, aircraft_of, names_code
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion import double_integrator as motion
-from sim_vehicles.motion.air import Air, Push, air_of
+from sim_vehicles.motion.air import Air, Push
 from sim_vehicles.motion.aircraft import Aircraft, Attitude
 from sim_vehicles.motion.double_integrator import COAST, VELOCITY_GAIN_1_S, Bounds, Command, State
 from sim_vehicles.motion.navigation import Navigator
@@ -83,7 +83,8 @@ class DoubleIntegrator:
         self._altitude_m = scenario.altitude_of(own)
         self._state = motion.state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
-        self._air = air_of(scenario, own.system_id, radio.start_ns, radio.recorder)
+        still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
+        self._air = None if still else Air(scenario, own.system_id, radio.start_ns, radio.recorder)
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
         self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
         """Dynamics in place of the double integrator's; `_air` is then set, too."""

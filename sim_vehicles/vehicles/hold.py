@@ -51,7 +51,6 @@ class Hold:
         return True
 
     def pop(self) -> Setpoint:
-        """Remove the first set-point."""
         _, _, setpoint = heapq.heappop(self._queue)
         self.next_ns = self._queue[0][0] if self._queue else NEVER_NS
         return setpoint

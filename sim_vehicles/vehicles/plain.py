@@ -78,11 +78,8 @@ def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) 
         return UNUSUAL
     if frame[PAYLOAD + 50] != vehicle.wire_id or component not in (0, AUTOPILOT):
         return UNUSUAL
-    north, east, down = (
-        read_float(frame, PAYLOAD + 28),
-        read_float(frame, PAYLOAD + 32),
-        read_float(frame, PAYLOAD + 36),
-    )
+    north, east = read_float(frame, PAYLOAD + 28), read_float(frame, PAYLOAD + 32)
+    down = read_float(frame, PAYLOAD + 36)
     if not abs(north) + abs(east) + abs(down) <= ABSURD:  # also if NaN
         return UNUSUAL
     acts_ns = max(time_ns, vehicle.state_ns)

@@ -171,9 +171,8 @@ class Shell(Generic[Flown]):
         schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
         intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
         for message_id, interval_us in intervals_us.items():
-            schedule.set_interval(
-                message_id, interval_us, radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
-            )
+            begin_ns = radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
+            schedule.set_interval(message_id, interval_us, begin_ns)
         self.services = Services(
             radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
         )
