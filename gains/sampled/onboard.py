@@ -77,8 +77,7 @@ class OnboardTiming:
 class OnboardLoop:
     """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when each part acts.
 
-    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others. Methods
-    without a docstring are those of `gains.sampled.coupled_block.ClosedLoop`.
+    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others.
     """
 
     A: FloatArray
@@ -109,6 +108,8 @@ class OnboardLoop:
             one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
             return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
         return lifted_margin(plants, rates, near_s=continuous_s)
+
+    # as of `gains.sampled.coupled_block.ClosedLoop`
 
     def growth_1_s(self, delay_s: float) -> float:
         return lifted_growth(self.plants(), self.timing.rates, delay_s=delay_s)
