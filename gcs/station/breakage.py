@@ -42,6 +42,11 @@ def not_formed(plan: FlightPlan, history: Reports) -> str:
     return ""
 
 
+def too_far(system_id: int, error_m: float, limit_m: float) -> str:
+    """Why a flight ends in which a vehicle has a larger spacing error than the limit."""
+    return f"broken: spacing error of vehicle {system_id} is {beyond(error_m, limit_m)} m, limit {limit_m:g} m"
+
+
 class Breakage:
     """Judges each tick of a flight, and remembers which vehicles are returning."""
 
@@ -84,9 +89,7 @@ class Breakage:
             error_m = hypot(*error)
             self._has_returned[row] |= not self._away[row] and not error_m > limit_m  # the leader has no spacing error
             if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
-                return (
-                    f"broken: spacing error of vehicle {ids[row]} is {beyond(error_m, limit_m)} m, limit {limit_m:g} m"
-                )
+                return too_far(ids[row], error_m, limit_m)
         self.all_back = all(self._has_returned) and not any(self._away)
         return ""
 

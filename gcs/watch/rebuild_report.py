@@ -18,6 +18,7 @@ from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
 from gcs.station.absence import COMPLETED
+from gcs.station.breakage import too_far
 from gcs.watch.links import LinkFigures
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
 from gcs.watch.tlog import TelemetryLog
@@ -136,5 +137,5 @@ def _broken(scenario: Scenario, last: TickArray) -> str:
     for row in last:
         error_m = hypot(row["spacing_error_north_m"], row["spacing_error_east_m"])
         if error_m > limit_m:
-            return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
+            return too_far(row["system_id"], error_m, limit_m)
     return ""

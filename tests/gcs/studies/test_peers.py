@@ -86,7 +86,7 @@ def test_a_plain_station_flies_the_closed_loop_beside_ours() -> None:
 
 
 def test_a_script_that_fails_says_why_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(PeerError, match="No such file"):
+    with pytest.raises(PeerError, match="read no such file, wanted a scenario file"):
         run_script("pymavlink_station", str(tmp_path / "none.toml"), "0", folder=tmp_path)
 
 

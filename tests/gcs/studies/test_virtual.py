@@ -77,7 +77,7 @@ def test_identified_responses_are_in_the_design() -> None:
 
 
 def test_what_the_command_refuses_is_refused() -> None:
-    with pytest.raises(ScenarioError, match="No such file"):
+    with pytest.raises(ScenarioError, match="read no such file, wanted a scenario file"):
         gcs.fly_virtual("nonsense")
     scenario = load(SCENARIOS / "chain3.toml")
     control = {"gains": FixedGains(K1=3.0, K2=0.0, K3=1.0), "delay_margin_s": None}
