@@ -9,6 +9,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import unlike_blocks
+from gcs.plan.expected_delay import expected_loop_delays_s
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, is_modelled, plan_loops
@@ -27,7 +28,8 @@ def growth_figure(
 ) -> Path | None:
     """Growth rate against loop delay: both models, the flights with their errors, and the residuals below.
 
-    The flights `own`, from the scenario's own initial states, are marked at the lower edge. Returns the file; None, and
+    The loop delay expected over the scenario's links is marked: that of the onset's vehicle, or of the slowest. The
+    flights `own`, from the scenario's own initial states, are marked at the lower edge. Returns the file; None, and
     nothing is drawn, if no flight has a growth rate.
     """
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
@@ -36,32 +38,24 @@ def growth_figure(
     delay_s = _column(probes, "loop_delay_s")
     measured, predicted, error = (_column(probes, name) for name in _RATES)
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
-    room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
-    grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 241)
+    expected_s = expected_loop_delays_s(study.plan.scenario)
+    here_s = max(expected_s.values()) if onset is None or onset.vehicle is None else expected_s[onset.vehicle]
+    first_s, last_s = min(here_s, float(delay_s.min())), max(here_s, float(delay_s.max()))
+    room_s = 0.03 * (last_s - first_s or 0.1)
+    grid_s = np.linspace(max(0.0, first_s - room_s), last_s + room_s, 241)
     # the formation's growth rate is the largest of its loops'
     above.axhline(0.0, color=LIMIT, linewidth=0.8)
-    blocks = plan_loops(study.plan)
-    if onset is not None and onset.vehicle is not None:
-        blocks = [block for block in blocks if onset.vehicle in block.system_ids]
-    if len(blocks[0].system_ids) > 1 and onset is not None and onset.vehicle is not None:
-        order = np.argsort(delay_s)
-        label = "sampled model, the other links as in the scenario"
-        above.plot(delay_s[order], predicted[order], color=SAMPLED, linewidth=1.4, label=label)
-    elif is_modelled(study.plan):
-        kinds = unlike_blocks(blocks)
-        sampled = np.array([[kind.loop.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds])
-        fastest, some_s = [kinds[k] for k in sampled.argmax(axis=0)[::_SPARSE]], grid_s[::_SPARSE]
-        continuous = [kind.growth_continuous_1_s(at) for kind, at in zip(fastest, some_s.tolist(), strict=True)]
-        above.plot(some_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
-        above.plot(grid_s, sampled.max(axis=0), color=SAMPLED, linewidth=1.4, label="sampled model, exact")
+    if is_modelled(study.plan):
+        _draw_models(above, study, grid_s, None if onset is None else onset.vehicle)
     style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
     above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
     _mark_own(above, own)
     margin_s = study.window_s[1] if onset is None or onset.vehicle is None else onset.predicted_s or np.inf
     if grid_s[0] <= margin_s <= grid_s[-1]:
         above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
-        at = (margin_s, float(measured.min()))
-        above.annotate(f" margin {margin_s:.4f} s", at, color=SAMPLED, ha="left", va="bottom", fontsize=9)
+        _note(above, f"margin {margin_s:.4f} s ", (margin_s, 0.08), SAMPLED, ha="right")
+    above.axvline(here_s, color=LIMIT, linestyle=":", linewidth=1.2)
+    _note(above, f" over the scenario's links {here_s:.3f} s", (here_s, 0.92), LIMIT)
     if onset is not None:
         above.plot([onset.loop_delay_s], [0.0], marker="D", color="none", markeredgecolor=MEASURED, markersize=11)
         text = f"onset in flight {onset.loop_delay_s:.4f} s"
@@ -78,6 +72,28 @@ def growth_figure(
     below.ticklabel_format(axis="y", scilimits=(-2, 2))
     above.sharex(below)
     return saved(figure, file)
+
+
+def _note(plot: Any, text: str, at: tuple[float, float], color: str, *, ha: str = "left") -> None:
+    """A text at a loop delay and a share of the plot's height."""
+    plot.annotate(text, at, xycoords=plot.get_xaxis_transform(), color=color, ha=ha, va="center", fontsize=9)
+
+
+def _draw_models(above: Any, study: Study, delays_s: FloatArray, vehicle: int | None) -> None:
+    """Draw the growth of the loop that grows fastest at each loop delay, or of one vehicle's loop, by both models."""
+    some_s, blocks = delays_s[::_SPARSE], plan_loops(study.plan)
+    if vehicle is not None:
+        blocks = [block for block in blocks if vehicle in block.system_ids]
+    if vehicle is not None and len(blocks[0].system_ids) > 1:
+        rates, label = map(study.growth_of(vehicle), some_s.tolist()), "model, the other links as in the scenario"
+        above.plot(some_s, list(rates), color=SAMPLED, linewidth=1.4, label=label)
+        return
+    kinds = unlike_blocks(blocks)
+    sampled = np.array([[kind.loop.growth_1_s(at) for at in delays_s.tolist()] for kind in kinds])
+    fastest = [kinds[k] for k in sampled.argmax(axis=0)[::_SPARSE]]
+    continuous = [kind.growth_continuous_1_s(at) for kind, at in zip(fastest, some_s.tolist(), strict=True)]
+    above.plot(some_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
+    above.plot(delays_s, sampled.max(axis=0), color=SAMPLED, linewidth=1.4, label="sampled model, exact")
 
 
 def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path | None:

@@ -56,11 +56,7 @@ class Study:
             return self.window_s
         if len(block.system_ids) == 1:
             return block.loop.window_s()
-        expected_s = expected_loop_delays_s(self.plan.scenario)
-        now_s = expected_s[system_id]
-
-        def growth_1_s(delay_s: float) -> float:
-            return _expected_growth_1_s(block, expected_s | {system_id: delay_s})
+        growth_1_s, now_s = self.growth_of(system_id), expected_loop_delays_s(self.plan.scenario)[system_id]
 
         def edge_s(step_s: float, end_s: float) -> float:
             at_s, rate_1_s = now_s, growth_1_s(now_s)
@@ -75,6 +71,12 @@ class Study:
 
         step_s = _ALONE_STEP * block.margin_s()
         return (0.0, 0.0) if growth_1_s(now_s) >= 0.0 else (edge_s(-step_s, 0.0), edge_s(step_s, np.inf))
+
+    def growth_of(self, system_id: int) -> Callable[[float], float]:
+        """The growth (1/s) predicted of a vehicle's loop at its loop delay (s), with all other links as they are."""
+        block = next(block for block in plan_loops(self.plan) if system_id in block.system_ids)
+        expected_s = expected_loop_delays_s(self.plan.scenario)
+        return lambda delay_s: _expected_growth_1_s(block, expected_s | {system_id: delay_s})
 
     def unstable_beside(self, system_id: int) -> list[int]:
         """The vehicles outside a vehicle's loop that are predicted to be unstable over the links of the scenario."""
