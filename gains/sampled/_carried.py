@@ -64,27 +64,30 @@ def carried_states(
 
     The states are the errors of each member in turn, and whatever follows them.
     """
-    axes, vehicles = model.axes, len(members)
-    errors = np.cumsum([0, *(model.axes * (1 + (i > 0)) for i in members)])
-    n = len(A) + axes * (0 in members)  # the leader's position is no error of its own
-    # x: the positions of all members, then all other states of e in their order
-    spacing = np.concatenate([np.arange(at, at + axes) for at, i in zip(errors, members, strict=False) if i > 0])
-    others = np.setdiff1d(np.arange(len(A)), spacing)
-    positions = np.arange(axes * vehicles).reshape(vehicles, axes)
+    step, at = np.arange(model.axes), 0
+    spacing, velocities = dict[int, IntArray](), list[IntArray]()
+    for i in members:
+        if i > 0:  # the leader's position is no error
+            spacing[i] = at + step
+            at += model.axes
+        velocities.append(at + step)
+        at += model.axes
+    # x: the positions of all members, then the states of e that are not spacing errors
+    others = np.setdiff1d(np.arange(len(A)), np.concatenate([*spacing.values()]))
+    positions = np.arange(len(members) * model.axes).reshape(len(members), model.axes)
     place = np.zeros(len(A), int)
     place[others] = positions.size + np.arange(others.size)
-    own_velocity = np.array([np.arange(end - axes, end) for end in errors[1:]])
+    n = positions.size + others.size
     error_of = np.zeros((len(A), n))
     error_of[others, place[others]] = 1.0
-    rows = dict(zip([i for i in members if i > 0], spacing.reshape(-1, axes), strict=True))
-    for k, i in enumerate(members):
-        if i in rows:
-            error_of[rows[i], positions[k]] = -1.0
-            if model.predecessors[i] in members:
-                error_of[rows[i], positions[members.index(model.predecessors[i])]] = 1.0
+    for i, rows in spacing.items():
+        error_of[rows, positions[members.index(i)]] = -1.0
+        if model.predecessors[i] in members:
+            error_of[rows, positions[members.index(model.predecessors[i])]] = 1.0
+    own_velocities = place[np.array(velocities)]
     moved, entry = np.zeros((n, n)), np.zeros((n, B.shape[1]))
     moved[np.ix_(place[others], place[others])] = A[np.ix_(others, others)]
-    moved[positions, place[own_velocity]] = 1.0
+    moved[positions, own_velocities] = 1.0
     entry[place[others]] = B[others]
-    inputs = np.arange(B.shape[1]).reshape(vehicles, axes)
-    return CarriedStates(moved, entry, K @ error_of, positions, place[own_velocity], inputs)
+    inputs = np.arange(B.shape[1]).reshape(positions.shape)
+    return CarriedStates(moved, entry, K @ error_of, positions, own_velocities, inputs)

@@ -298,9 +298,10 @@ def delay_text(summary: Summary) -> str:
         way = "slower gains" if summary.prediction == "off" else "prediction"
         margin += f", up to {ms_text(slowest_s)} with {way}"
     bound_s, closest = summary.loop_delay_bound_s, summary.closest_to_margin
+    over = " over all vehicles" if len(summary.vehicles) > 1 else ""
     error = "" if bound_s is None else f" (clocks: ± {ms_text(bound_s)})"
     return (
-        f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max{error}; "
+        f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max{over}{error}; "
         f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}{'' if closest is None else _of(closest)}"
     )
 
