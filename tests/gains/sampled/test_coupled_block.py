@@ -68,3 +68,22 @@ def test_the_critical_block_grows_most_at_its_own_delay() -> None:
     assert critical_block(blocks, delays).system_ids == (4,)
     assert critical_block(blocks, {**delays, 1: 0.6}).system_ids == (1,)
     assert critical_block(blocks, dict.fromkeys(delays, 0.25)).system_ids == (2,)  # the first of equals
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_positions_instead_of_errors_leave_the_growth_as_it_is(whole: bool) -> None:
+    """With and without the leader in the loop; vehicles respond each in its own way, all states have one age."""
+    model = FormationModel((-1, 0, 1))
+    K = model.overlapping_gain(-1.778 * np.eye(2), 0.549 * np.eye(2), 1.43 * np.eye(2))
+    K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)
+    K[model.input_slice(1), model.spacing_slice(2)] = -0.2 * np.eye(2)
+    if whole:
+        K[model.input_slice(0), model.spacing_slice(1)] = -0.2 * np.eye(2)
+    responses = [Response(0.125, 2.78), Response(0.066, 1.88, 0.048), Response(0.11, 1.71, 0.0, 14.0)]
+    loop, states = formation_loop(model, K, responses), response_states(model, responses)
+    timing, ids = Timing(0.02, 0.02), (1, 2, 3)
+    [*_, shared] = coupled_blocks(model, K, ids, timing=timing, responding=loop, response_states=states)
+    assert shared.system_ids == (ids if whole else (2, 3))
+    delays_s = {1: 0.2, 2: 0.3, 3: 0.25}
+    of_positions = shared.growth_continuous_at_1_s(delays_s, dict.fromkeys(ids, 0.1))
+    assert of_positions == pytest.approx(shared.growth_continuous_at_1_s(delays_s), abs=1e-9)
