@@ -13,7 +13,7 @@ from gcs.control.tick import Event
 from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep, prepare
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
-from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
+from gcs.drive.udp import StationSocket, clock_ns, drive
 from gcs.interrupts import held_back, stop_signals
 from gcs.link.datagram import Frames
 from gcs.plan.design import Design
@@ -27,6 +27,7 @@ from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from scenarios.schema import NS_PER_S
+from scenarios.undisturbed import undisturbed
 
 _OBSERVER_PATIENCE_S = 60.0
 _START_DELAY_NS = NS_PER_S // 5

@@ -5,15 +5,12 @@ arrived, so a busy station does not lengthen the delays that it measures.
 """
 
 import contextlib
-import ctypes
 import errno
-import gc
-import os
 import select
 import socket
 import time  # noqa: TID251 - this is a driver
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Self
 
@@ -43,7 +40,6 @@ _LONG_NS, _SOONER_NS = 500_000, 3_000_000
 """If what it did when it last woke took longer than the first time, it wakes after the second."""
 _BEFORE_TICK_NS = 2_000_000
 """What has arrived is read this long before a tick. 250 vehicles send 30 datagrams in the time that is left."""
-_PR_SET_TIMERSLACK = 29
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 
 
@@ -201,30 +197,6 @@ def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket
             sockets[network] = own
         opened.pop_all()
     return sockets
-
-
-@contextlib.contextmanager
-def undisturbed(*, own_code: bool) -> Generator[None]:
-    """While entered, this process wakes on time: minimum timer slack, no garbage collection, real-time priority.
-
-    Real-time priority needs root, or `ulimit -r` of at least 1; without either it is left as it is. With 250 vehicles a
-    garbage collection takes 30 ms. The station makes no reference cycles. The user's `own_code` may: with it, garbage
-    is collected, but not among objects that exist already.
-    """
-    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    gc.collect()
-    gc.freeze()
-    if not own_code:
-        gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
 def drive(

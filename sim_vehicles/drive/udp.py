@@ -4,22 +4,19 @@ The kernel stamps what arrives, so the emulated down link begins when the datagr
 read it. Datagrams leave within some tens of microseconds of their due time.
 """
 
-import contextlib
-import ctypes
-import gc
-import os
 import resource
 import select
 import socket
 import time  # noqa: TID251 - this is the real-time driver
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from scenarios.networks import network_of
 from scenarios.schema import NS_PER_S
 from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, Writer, joined, number_of, stamped
+from scenarios.undisturbed import undisturbed
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
@@ -37,7 +34,6 @@ LATE_NS = 5_000_000
 
 _OTHER_FILES = 100
 """Files that are open beside the sockets, and room for more."""
-_PR_SET_TIMERSLACK = 29
 
 
 class Sockets:
@@ -183,26 +179,3 @@ def run(
                 next_look_ns = now_ns + LONGEST_WAIT_NS
                 if look(now_ns):
                     return
-
-
-@contextlib.contextmanager
-def undisturbed() -> Generator[None]:
-    """While entered, timers are as exact as the kernel allows, no garbage collection runs, and priority is real-time.
-
-    Real-time priority needs root, or `ulimit -r` of at least 1; without either it is left as it is.
-    """
-    # The default timer slack lets the kernel delay a wake-up by 50 µs.
-    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    # A collection stops the loop for milliseconds. The loop makes no reference cycles, so memory does not grow.
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
