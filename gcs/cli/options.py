@@ -151,6 +151,10 @@ def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
     """Refuse a scenario for a finding, or only warn of it if the user allows it."""
     if not allow:
         refuse(file, finding)
+    warn(file, finding)
+
+
+def warn(file: Path, finding: str) -> None:
     print(f"warning: {file}: {finding}", file=sys.stderr)
 
 
@@ -269,7 +273,7 @@ def unmet_headroom(found: float | None, least: float) -> str:
     if found is not None and found >= least:
         return ""
     read = "no headroom" if found is None else beyond(100.0 * found, 100.0 * least, 1) + "%"
-    return f"--assert-headroom: read {read}, wanted at least {least:.1%}"
+    return f"--assert-headroom: read {read}, wanted at least {100.0 * least:g}%"
 
 
 def say_failed(failure: str) -> None:

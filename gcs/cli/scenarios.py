@@ -185,7 +185,7 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         "command\nm/s²": lambda v: f"{v.command_m_s2:.2f}",
         "limit\nm/s²": lambda v: number_text(v.command_max_m_s2, ".2f"),
         "loop\nms": lambda v: ms_text(v.expected_loop_delay_s, unit=""),
-        "headroom\nms": lambda v: ms_text(v.headroom_s, unit=""),
+        "link takes\nmore, ms": lambda v: ms_text(v.link_delay_left_s, unit=""),
     }
     console.print(table_of(found.vehicles, columns, title=title, dense=True))
     if beyond := [v.system_id for v in found.vehicles if v.command_m_s2 > (v.command_max_m_s2 or float("inf"))]:

@@ -112,7 +112,14 @@ def stress(
             raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, such as 0.02")
     outlive_readers()
     if disturbance:
-        more = {"--resume": resume, "--trial": trial, "--dask": dask, "--real-time": real_time, "--junit": junit}
+        more = {
+            "--onset-of": onset_of,
+            "--resume": resume,
+            "--trial": trial,
+            "--dask": dask,
+            "--real-time": real_time,
+            "--junit": junit,
+        }
         others = [option for option, value in (*given, *more.items()) if value and option != "--delay"]
         if not onset or others:
             read = f"and {others[0]}" if others else "without --onset"
@@ -173,7 +180,7 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, *, searches: boo
 
 
 def _refuse_vehicle(system_id: int, study: "Study", given: list[tuple[str, str]]) -> None:
-    from gcs.stress.trial import plan_loops
+    from gcs.plan.loops import plan_loops
 
     known = study.plan.formation.system_ids
     if system_id not in known:
@@ -284,6 +291,7 @@ def _campaign(
 ) -> "tuple[CampaignResult, Path]":
     """Fly the sweep over the axes and, with a tolerance, search for the onset; returns the result and its folder."""
     from gcs.drive.fly import new_folder
+    from gcs.plan.loops import window_of
     from gcs.runs.record import SCENARIO_FILE, write_whole
     from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
@@ -316,7 +324,7 @@ def _campaign(
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
                 onset = find_onset(study, run, tolerance=tolerance, vehicle=vehicle)
-                if (study.window_s if vehicle is None else study.window_of(vehicle))[0] > 0.0:
+                if (study.window_s if vehicle is None else window_of(study.plan, vehicle))[0] > 0.0:
                     onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
         except NoOnset as reason:
             onset = reason

@@ -18,10 +18,11 @@ from gains.sampled.coupled_block import CoupledBlock, PredictedLoop, unlike_bloc
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gains.varying.predicted import PredictedSpread
+from gcs.plan.loops import plan_loops
 from gcs.stress.axes import PREDICTION, Axis, at_coordinates, every_link
 from gcs.stress.figures import MEASURED
 from gcs.stress.study import Study
-from gcs.stress.trial import Outcome, plan_loops
+from gcs.stress.trial import Outcome
 from gcs.views.page import figure_of, saved
 
 _PREDICTED, _GUARANTEED, _SEVERAL, _BLANK = "black", "#1b7837", "#7b3294", "#c8c8c8"

@@ -10,9 +10,10 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.expected_delay import expected_loop_delays_s
+from gcs.plan.loops import growth_of, is_modelled, plan_loops
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
-from gcs.stress.trial import Outcome, is_modelled, plan_loops
+from gcs.stress.trial import Outcome
 from gcs.views.page import figure_of, saved
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
@@ -85,7 +86,7 @@ def _draw_models(above: Any, study: Study, delays_s: FloatArray, vehicle: int | 
     if vehicle is not None:
         blocks = [block for block in blocks if vehicle in block.system_ids]
     if vehicle is not None and len(blocks[0].system_ids) > 1:
-        rates, label = map(study.growth_of(vehicle), some_s.tolist()), "model, the other links as in the scenario"
+        rates, label = map(growth_of(study.plan, vehicle), some_s.tolist()), "model, the other links as in the scenario"
         above.plot(some_s, list(rates), color=SAMPLED, linewidth=1.4, label=label)
         return
     kinds = unlike_blocks(blocks)

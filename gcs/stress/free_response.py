@@ -45,10 +45,10 @@ from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight, fly_plan, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import is_modelled
 from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
-from gcs.stress.trial import is_modelled
 from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link
 from scenarios.schema import Limits, NominalVelocity, Safety, Scenario, Vehicle

@@ -20,21 +20,12 @@ from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import first_uses, fly_plan, median_ages_s, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import is_modelled, plan_loops
 from gcs.stress import free_response
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
-from gcs.stress.trial import (
-    CRITICAL,
-    TRACE_PERIOD_S,
-    Outcome,
-    Trial,
-    finite,
-    is_modelled,
-    plan_loops,
-    plan_of,
-    with_verdict,
-)
+from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_of, with_verdict
 
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""

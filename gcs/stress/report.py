@@ -14,12 +14,13 @@ from pydantic import PlainSerializer
 
 from gcs.errors import extra_wanted
 from gcs.plan.design import Design, ResponsePart
+from gcs.plan.loops import plan_loops
 from gcs.published import Published
 from gcs.runs.record import write_whole
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.figures import worst_of
 from gcs.stress.study import NoOnset, Onset, Study, curve_error
-from gcs.stress.trial import Outcome, plan_loops
+from gcs.stress.trial import Outcome
 from gcs.views.page import data_uri, rendered
 
 REPORT_FILE = "report.html"

@@ -1,6 +1,6 @@
 """Which trials a campaign flies: over its axes, and in search of the onset."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import PlainSerializer
 
-from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
-from gcs.plan.expected_delay import expected_loop_delays_s
+from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import is_modelled, plan_loops, unstable_over_links, window_of
 from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.growth import GrowthPoint, Zero, locate_zero
-from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, is_modelled, plan_loops, sparse_gain
+from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, sparse_gain
 
 _BRACKET_LINKS_S = (0.0, 0.05, 0.1, 0.2), (0.4, 0.8, 1.6)
 """Link delays (s), up plus down, that are flown to find out where errors begin to grow: the second if they do not in
@@ -26,8 +26,6 @@ _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
 """Half widths of the first and the finest round of an onset search, in tolerances."""
-_ALONE_STEP, _ALONE_STEPS = 0.1, 100
-"""Steps, in margins of the whole loop, in which the margin of one of its vehicles is searched, and their number."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
@@ -44,45 +42,6 @@ class Study:
         """The loop delays between which the plan is predicted to be stable; without prediction the first is 0."""
         assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
-
-    def window_of(self, system_id: int) -> Window:
-        """The loop delays of one vehicle between which its loop is predicted to be stable.
-
-        The links of all other vehicles stay as they are in the scenario. Where these share a loop with the vehicle, the
-        window is known roughly: from a line through the growth at steps from the loop delay that is expected of it.
-        """
-        block = next(block for block in plan_loops(self.plan) if system_id in block.system_ids)
-        if not is_modelled(self.plan):
-            return self.window_s
-        if len(block.system_ids) == 1:
-            return block.loop.window_s()
-        growth_1_s, now_s = self.growth_of(system_id), expected_loop_delays_s(self.plan.scenario)[system_id]
-
-        def edge_s(step_s: float, end_s: float) -> float:
-            at_s, rate_1_s = now_s, growth_1_s(now_s)
-            for k in range(1, _ALONE_STEPS):
-                inner_s, inner_1_s, at_s = at_s, rate_1_s, now_s + k * step_s
-                if at_s <= 0.0:
-                    return end_s
-                rate_1_s = growth_1_s(at_s)
-                if rate_1_s >= 0.0:
-                    return inner_s + (at_s - inner_s) * inner_1_s / (inner_1_s - rate_1_s)
-            return end_s
-
-        step_s = _ALONE_STEP * block.margin_s()
-        return (0.0, 0.0) if growth_1_s(now_s) >= 0.0 else (edge_s(-step_s, 0.0), edge_s(step_s, np.inf))
-
-    def growth_of(self, system_id: int) -> Callable[[float], float]:
-        """The growth (1/s) predicted of a vehicle's loop at its loop delay (s), with all other links as they are."""
-        block = next(block for block in plan_loops(self.plan) if system_id in block.system_ids)
-        expected_s = expected_loop_delays_s(self.plan.scenario)
-        return lambda delay_s: _expected_growth_1_s(block, expected_s | {system_id: delay_s})
-
-    def unstable_beside(self, system_id: int) -> list[int]:
-        """The vehicles outside a vehicle's loop that are predicted to be unstable over the links of the scenario."""
-        expected_s = expected_loop_delays_s(self.plan.scenario)
-        others = [b for b in plan_loops(self.plan) if is_modelled(self.plan) and system_id not in b.system_ids]
-        return [own for block in others if _expected_growth_1_s(block, expected_s) >= 0.0 for own in block.system_ids]
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
         """The trial at one point. `seed` is the scenario's, from which clocks, jitter and loss are drawn."""
@@ -109,12 +68,6 @@ class Study:
         kinds: tuple[Kind, ...] = ("own",) if self.real_time and not constant else ("probe", "own")
         first = self.plan.scenario.seed
         return [self.trial(kind, point, seed=first + k) for kind, point, k in product(kinds, points, range(seeds))]
-
-
-def _expected_growth_1_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
-    """The growth at expected loop delays: a state is at the station after half of the link delay and of the waiting."""
-    waiting_s = block.timing.faster_s / 2.0
-    return block.growth_at_1_s(loop_delay_s, {own: (at_s + waiting_s) / 2.0 for own, at_s in loop_delay_s.items()})
 
 
 _Flights = tuple[Annotated[Outcome, PlainSerializer(lambda outcome: outcome.id)], ...]
@@ -179,7 +132,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     """
     slowed = _Slowed(study, vehicle)
     expected_s, way = slowed.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
-    if vehicle is not None and (unstable := study.unstable_beside(vehicle)):
+    if vehicle is not None and (unstable := unstable_over_links(study.plan, but=vehicle)):
         who = f"vehicle{'s' * (len(unstable) > 1)} {' '.join(map(str, unstable))}"
         raise NoOnset(f"the links of the scenario alone make {who} unstable, by prediction")
     if expected_s == np.inf:
@@ -249,7 +202,7 @@ class _Slowed:
 
     @property
     def window_s(self) -> Window:
-        return self.study.window_s if self.vehicle is None else self.study.window_of(self.vehicle)
+        return self.study.window_s if self.vehicle is None else window_of(self.study.plan, self.vehicle)
 
     def at(self, link_s: float) -> dict[str, float]:
         """The coordinates of a link delay, up plus down."""

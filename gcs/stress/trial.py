@@ -8,21 +8,17 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from math import isnan
 from typing import Literal
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gains.performance.response import formation_loop, response_states
-from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight
-from gcs.plan.flight_plan import FlightPlan, Responses, onboard_timing
+from gcs.plan.flight_plan import FlightPlan, Responses
 from gcs.plan.formation import plan_formation
 from gcs.plan.own_law import law_of
 from gcs.runs.summary import control_of, judge
-from scenarios.keys.own import BUILT_IN
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
@@ -130,27 +126,6 @@ def plan_of(trial: Trial) -> FlightPlan:
     scenario = trial.scenario.with_calm_monitor()
     law = law_of(scenario)
     return FlightPlan(scenario, formation, K, trial.delay_margin_s, responses=trial.responses, law=law)
-
-
-def is_modelled(plan: FlightPlan) -> bool:
-    """Whether the models of `plan_loops` describe the flights: not those of a law that is not linear, or of dynamics of
-    one's own, of which they tell only which vehicles are coupled."""
-    return not isnan(plan.delay_margin_s) and plan.scenario.dynamics in BUILT_IN
-
-
-def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
-    """The coupled blocks of a plan, with the vehicles' responses if they are known."""
-    responses = plan.responses_in_order if is_modelled(plan) else None
-    return coupled_blocks(
-        plan.model,
-        plan.gain,
-        plan.formation.system_ids,
-        timing=plan.timing,
-        onboard=onboard_timing(plan.scenario),
-        assumed_s=plan.assumed_s,
-        responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
-        response_states=() if responses is None else response_states(plan.model, responses),
-    )
 
 
 def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

@@ -16,6 +16,7 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.upload import float32
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import plan_loops
 from gcs.plan.onboard import own_parameters
 from gcs.plan.planner import flight_plan
 from gcs.runs.grade import instants, true_loop_delays_s
@@ -26,7 +27,7 @@ from gcs.stress.free_response import fly_calm, response_paired
 from gcs.stress.growth import fit_growth, motion_of
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Study, find_onset
-from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
+from gcs.stress.trial import CRITICAL, Outcome, Trial, sparse_gain
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop
 from scenarios.keys.link import Link, Outage, VehicleLinks

@@ -44,7 +44,7 @@ def test_each_assertion_that_fails_is_named(
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert failed == ["the headroom is at least 90.0%", "the errors settle within 0.1 s"]
     headroom, settled = capfd.readouterr().err.splitlines()
-    assert re.fullmatch(r"failed: --assert-headroom: read \d\d\.\d%, wanted at least 90\.0%", headroom)
+    assert re.fullmatch(r"failed: --assert-headroom: read \d\d\.\d%, wanted at least 90%", headroom)
     assert re.fullmatch(r"failed: --assert-settled: read \d+\.\d+ s, wanted at most 0\.1 s", settled)
 
 
@@ -85,5 +85,5 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
 
     assert [checked("0.8"), checked("0.82"), checked("2")] == [0, 1, 2]
     failed, refused = capfd.readouterr().err.splitlines()
-    assert failed == "failed: --assert-headroom: read 80.1%, wanted at least 82.0%"
+    assert failed == "failed: --assert-headroom: read 80.1%, wanted at least 82%"
     assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"

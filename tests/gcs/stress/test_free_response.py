@@ -11,13 +11,13 @@ from scipy.linalg import expm
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import CoupledBlock
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import plan_loops
 from gcs.runs.grade import ACTED, SAMPLED, commands_of, effective_delay_s, instants
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, in_place, response_paired
 from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.stress.trial import plan_loops
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Limits
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan

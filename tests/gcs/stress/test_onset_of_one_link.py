@@ -8,15 +8,33 @@ from typer.testing import CliRunner
 from gcs.cli.main import app
 from gcs.drive.check import check
 from gcs.errors import InputError
+from gcs.plan.loops import plan_loops, unstable_together
 from gcs.plan.planner import flight_plan
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
-from gcs.stress.trial import plan_loops
-from scenarios.files import dump, load
+from scenarios.files import dump, load, parse
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Scenario
 from scenarios.shipped import located
 from tests.support.fleets.stress_pair import SCENARIO
+
+EACH_OTHER = """
+name = "each_other"
+seed = 1
+duration_s = 20.0
+nominal_velocity = [{ from_s = 0.0, velocity_ne_m_s = [25.0, 0.0] }]
+vehicles = [
+    { system_id = 1, position_ne_m = [0, 0], velocity_ne_m_s = [25, 0] },
+    { system_id = 2, follows = 1, offset_ne_m = [-40, 40], position_ne_m = [-40.2, 40.1], velocity_ne_m_s = [25, 0] },
+]
+[control]
+blocks = [
+    { vehicle = 1, of = 1, gain = [[-0.7, 0.0], [0.0, -0.7]] },
+    { vehicle = 1, of = 2, gain = [[3.0, 0.0, -1.0, 0.0], [0.0, 3.0, 0.0, -1.0]] },
+    { vehicle = 2, of = 1, gain = [[0.46, 0.0], [0.0, 0.46]] },
+    { vehicle = 2, of = 2, gain = [[3.67, 0.0, -2.0, 0.0], [0.0, 3.67, 0.0, -2.0]] },
+]
+"""
 
 
 def with_links(scenario: Scenario, **delays_s: float) -> Scenario:
@@ -104,5 +122,24 @@ def test_what_is_printed_names_the_vehicle_and_what_is_left(tmp_path: Path) -> N
 def test_a_check_has_the_headroom_of_each_vehicle() -> None:
     found = check(flight_plan(with_links(load(located("chain3")), all=0.02, v3=0.09))[1])
     assert [own.expected_loop_delay_s for own in found.vehicles] == pytest.approx([0.05, 0.05, 0.19])
-    assert [own.headroom_s for own in found.vehicles] == pytest.approx([0.25, 0.25, 0.11])
+    leader_s = plan_loops(study_of(load(located("chain3"))).plan)[0].margin_s()
+    assert [own.link_delay_left_s for own in found.vehicles] == pytest.approx([leader_s - 0.05, 0.25, 0.11])
     assert found.headroom == found.vehicles[2].headroom == pytest.approx(0.11 / 0.3)
+
+
+def test_a_shared_loop_may_break_far_below_its_margin() -> None:
+    """Both look at each other. If links are alike they take 630 ms of loop delay; one alone takes 363 ms."""
+    scenario = with_links(parse(EACH_OTHER, Path("each_other.toml")), all=0.0, v2=0.285)
+    plan = study_of(scenario).plan
+    found = check(plan)
+    _, follower = found.vehicles
+    assert plan.delay_margin_s > 0.6 > follower.expected_loop_delay_s
+    assert found.headroom is not None
+    assert found.headroom < -0.5
+    assert "share a loop that their links make unstable" in unstable_together(plan)
+    assert follower.expected_loop_delay_s + (follower.link_delay_left_s or 0.0) == pytest.approx(0.3635, abs=4e-3)
+    onset = onset_of(scenario, 2)  # from a link that is past it
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # 4e-5
+    assert onset.link_delay_left_s is not None
+    assert onset.link_delay_left_s < -0.2
+    assert unstable_together(study_of(with_links(scenario, all=0.1)).plan) == ""

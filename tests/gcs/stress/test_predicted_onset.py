@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import pytest
 
+from gcs.plan.loops import plan_loops
 from gcs.plan.planner import flight_plan
 from gcs.stress.study import Study, curve_error, find_onset
-from gcs.stress.trial import Outcome, Trial, plan_loops
+from gcs.stress.trial import Outcome, Trial
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains
 from tests.support.paths import SCENARIOS

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from gcs.plan.loops import plan_loops
 from gcs.stress.axes import Axis, at_coordinates
 from gcs.stress.boundary import cell_edges, guaranteed_line, map_figure, two_delays_lines
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.stress.trial import Outcome, plan_loops, plan_of
+from gcs.stress.trial import Outcome, plan_of
 from scenarios.keys.link import Jitter, Link
 from scenarios.schema import FixedGains
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan

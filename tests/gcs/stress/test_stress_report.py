@@ -17,6 +17,7 @@ from gcs.cli.results import checks_of
 from gcs.cli.stress import stress
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.loops import plan_loops
 from gcs.runs.junit import write_junit
 from gcs.runs.record import SUMMARY_FILE
 from gcs.stress.campaign import TRIALS_FILE, local_workers, run_campaign, trials_of
@@ -116,7 +117,6 @@ def test_a_margin_that_the_gains_lack_is_exposed(tmp_path: Path) -> None:
 
 
 def margin_of(plan: FlightPlan) -> float:
-    from gcs.stress.trial import plan_loops
 
     return min(loop.margin_s() for loop in plan_loops(plan))
 

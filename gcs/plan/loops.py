@@ -1,0 +1,146 @@
+"""The loops of a formation, each stable or not by itself, and how close its expected loop delays are to its edge.
+
+In a leader-follower tree every vehicle closes a loop of its own, and only its own link matters. Vehicles that also hear
+those behind them share a loop. It has a margin, which is a loop delay that all have; where their links differ, it says
+little: such a loop may break far below it or stand far above. What counts then is its growth at all of its loop delays.
+"""
+
+from collections.abc import Callable, Hashable, Mapping
+from math import inf, isnan, nan
+
+from gains.performance.response import formation_loop, response_states
+from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
+from gcs.plan.expected_delay import expected_loop_delays_s
+from gcs.plan.flight_plan import FlightPlan, onboard_timing
+from gcs.plan.mismatch import Window
+from scenarios.keys.own import BUILT_IN
+
+_STEP, _STEPS = 0.1, 100
+"""Steps, in margins of the whole loop, in which the edge of a shared loop is searched, and their number."""
+_HALVINGS = 8
+_MOST_SHARING = 6
+"""Most vehicles of a shared loop whose links are searched one by one, which takes seconds."""
+
+
+def is_modelled(plan: FlightPlan) -> bool:
+    """Whether the models of `plan_loops` describe the flights: not those of a law that is not linear, or of dynamics of
+    one's own, of which they tell only which vehicles are coupled."""
+    return not isnan(plan.delay_margin_s) and plan.scenario.dynamics in BUILT_IN
+
+
+def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
+    """The coupled blocks of a plan, with the vehicles' responses if they are known."""
+    responses = plan.responses_in_order if is_modelled(plan) else None
+    return coupled_blocks(
+        plan.model,
+        plan.gain,
+        plan.formation.system_ids,
+        timing=plan.timing,
+        onboard=onboard_timing(plan.scenario),
+        assumed_s=plan.assumed_s,
+        responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
+        response_states=() if responses is None else response_states(plan.model, responses),
+    )
+
+
+def loop_of(plan: FlightPlan, system_id: int) -> CoupledBlock:
+    """The loop of a vehicle."""
+    return next(block for block in plan_loops(plan) if system_id in block.system_ids)
+
+
+def growth_1_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
+    """The growth at expected loop delays: a state is at the station after half of the link delay and of the waiting."""
+    waiting_s = block.timing.faster_s / 2.0
+    return block.growth_at_1_s(loop_delay_s, {own: (at_s + waiting_s) / 2.0 for own, at_s in loop_delay_s.items()})
+
+
+def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
+    """The growth (1/s) predicted of a vehicle's loop at its loop delay (s), with all other links as in the scenario."""
+    block, expected_s = loop_of(plan, system_id), expected_loop_delays_s(plan.scenario)
+    return lambda delay_s: growth_1_s(block, expected_s | {system_id: delay_s})
+
+
+def window_of(plan: FlightPlan, system_id: int) -> Window:
+    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if no model predicts it.
+
+    The links of all other vehicles stay as they are in the scenario. In a shared loop that is unstable over them, the
+    shorter delays of this vehicle are searched; (0, 0) if none makes it stable.
+    """
+    block = loop_of(plan, system_id)
+    if not is_modelled(plan):
+        return 0.0, plan.delay_margin_s
+    if len(block.system_ids) == 1:
+        return block.loop.window_s()
+    growth, now_s = growth_of(plan, system_id), expected_loop_delays_s(plan.scenario)[system_id]
+    step_s, stable = _STEP * block.margin_s(), growth(now_s) < 0.0
+    shorter_s = 0.0
+    if plan.assumed_s is not None or not stable:
+        shorter_s = _edge_s(growth, now_s, -step_s, end_s=0.0, stable=stable)
+    return (shorter_s, _edge_s(growth, now_s, step_s, end_s=inf, stable=True)) if stable else (0.0, shorter_s)
+
+
+def _edge_s(growth: Callable[[float], float], at_s: float, step_s: float, *, end_s: float, stable: bool) -> float:
+    """Where stability ends or, if the loop is not `stable` to begin with, begins; `end_s` if it does not."""
+    for _ in range(_STEPS):
+        inner_s, at_s = at_s, at_s + step_s
+        at_s = max(0.0, at_s)
+        if (growth(at_s) < 0.0) != stable:
+            for _ in range(_HALVINGS):
+                middle_s = (inner_s + at_s) / 2.0
+                inner_s, at_s = (middle_s, at_s) if (growth(middle_s) < 0.0) == stable else (inner_s, middle_s)
+            return (inner_s + at_s) / 2.0
+        if at_s == 0.0:
+            break
+    return end_s
+
+
+def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int]:
+    """The vehicles whose loops are predicted to be unstable over the scenario's links, outside the loop of `but`."""
+    expected_s = expected_loop_delays_s(plan.scenario)
+    loops = plan_loops(plan) if is_modelled(plan) else []
+    unstable = [each for each in loops if but not in each.system_ids and growth_1_s(each, expected_s) >= 0.0]
+    return [own for block in unstable for own in block.system_ids]
+
+
+def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
+    """Whether vehicles share this loop over links that differ, so that its margin says little, and a model knows more.
+
+    None does with loops on board or prediction.
+    """
+    delays_s = expected_loop_delays_s(plan.scenario)
+    return len({delays_s[own] for own in block.system_ids}) > 1 and block.carried is not None and is_modelled(plan)
+
+
+def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
+    """How much more delay each vehicle's link takes with all others as in the scenario: NaN where it is not known."""
+    expected_s, windows, left_s = expected_loop_delays_s(plan.scenario), dict[Hashable, Window](), dict[int, float]()
+    for block in plan_loops(plan):
+        for system_id in block.system_ids:
+            alone = len(block.system_ids) == 1
+            key = block.kind if alone else system_id
+            known = alone or (block.carried is not None and len(block.system_ids) <= _MOST_SHARING)
+            if key not in windows:
+                windows[key] = window_of(plan, system_id) if known else (0.0, nan)
+            left_s[system_id] = windows[key][1] - expected_s[system_id]
+    return left_s
+
+
+def unstable_together(plan: FlightPlan) -> str:
+    """What the scenario's links make unstable among the loops that vehicles share; empty if nothing."""
+    for block in plan_loops(plan):
+        if links_differ(plan, block) and growth_1_s(block, expected_loop_delays_s(plan.scenario)) >= 0.0:
+            return f"vehicles {' '.join(map(str, block.system_ids))} share a loop that their links make unstable"
+    return ""
+
+
+def shared_headroom(plan: FlightPlan, block: CoupledBlock) -> float:
+    """The headroom of a loop that vehicles share: 1 − 1/f if it breaks at f times its expected loop delays."""
+    expected_s = expected_loop_delays_s(plan.scenario)
+    own_s = {own: expected_s[own] for own in block.system_ids}
+
+    def growth(factor: float) -> float:
+        return growth_1_s(block, {own: factor * at_s for own, at_s in own_s.items()})
+
+    stable, step = growth(1.0) < 0.0, _STEP * block.margin_s() / max(own_s.values())
+    edge = _edge_s(growth, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)
+    return 1.0 - 1.0 / edge if edge > 0.0 else -inf
