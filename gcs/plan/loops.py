@@ -107,8 +107,10 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
     None does with loops on board or prediction.
     """
+    if block.carried is None or not is_modelled(plan):
+        return False
     delays_s = expected_loop_delays_s(plan.scenario)
-    return len({delays_s[own] for own in block.system_ids}) > 1 and block.carried is not None and is_modelled(plan)
+    return len({delays_s[own] for own in block.system_ids}) > 1
 
 
 def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
@@ -127,7 +129,7 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
 
 def unstable_together(plan: FlightPlan) -> str:
     """What the scenario's links make unstable among the loops that vehicles share; empty if nothing."""
-    for block in plan_loops(plan):
+    for block in [] if plan.separable else plan_loops(plan):
         if links_differ(plan, block) and growth_1_s(block, expected_loop_delays_s(plan.scenario)) >= 0.0:
             return f"vehicles {' '.join(map(str, block.system_ids))} share a loop that their links make unstable"
     return ""
