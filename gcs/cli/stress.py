@@ -105,7 +105,7 @@ def stress(
         out = options.campaign_folder(out, "--trial" if trial else "--resume", "campaign")
     elif out is not None:
         options.refuse_out(out, _OUT_WANTED)
-    _refuse_axes(given, prediction, searches=bool(trial or onset or disturbance))
+    _refuse_axes(given, prediction, seeds, searches=bool(trial or onset or disturbance))
     given += [("--prediction", prediction)] if prediction else []
     for name, value in (("--tolerance", tolerance), ("--assert-onset", assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
@@ -170,9 +170,11 @@ def stress(
     raise typer.Exit(0 if result.passed else FAILED)
 
 
-def _refuse_axes(given: list[tuple[str, str]], prediction: str, *, searches: bool) -> None:
+def _refuse_axes(given: list[tuple[str, str]], prediction: str, seeds: int, *, searches: bool) -> None:
     if not (given or searches):
         raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
+    if seeds > 1 and not given:
+        raise InputError(f"--seeds: read {seeds}, wanted it with an axis: a search draws its own seeds")
     if len(given) > 2:
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
     if prediction and (len(given) != 2 or searches):

@@ -235,6 +235,8 @@ def test_a_real_time_trial_records_the_machines_noise(tmp_path: Path) -> None:
         (["--delay-of", "9=0:1:2"], "system id of a vehicle"),
         (["--delay", "0", "--rate", "50", "--loss", "0"], "wanted one (a sweep) or two (a map)"),
         (["--onset", "--tolerance", "2"], "wanted a fraction between 0 and 1"),
+        (["--onset-of", "2", "--seeds", "3"], "--seeds: read 3, wanted it with an axis"),
+        (["--onset-of", "2", "--onset", "--disturbance"], "read --disturbance and --onset-of"),
         (["--onset", "--resume"], "--resume: read no --out, wanted --out with the folder of a campaign"),
         (["--trial", "1234"], "--trial: read no --out, wanted --out with the folder of a campaign"),
         (["--onset", "--dask", "no address"], "wanted the address of a Dask scheduler"),
