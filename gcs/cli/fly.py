@@ -15,6 +15,7 @@ from gcs.output import outlive_readers
 from scenarios.networks import networks_of
 
 if TYPE_CHECKING:
+    from gcs.plan.design import Design
     from gcs.plan.flight_plan import FlightPlan
     from gcs.runs.summary_record import Summary
 
@@ -111,7 +112,7 @@ def fly(
             chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
         )
         design, plan = flight_plan(scenario, measured)
-        plan = _flyable(scenario_file, plan, allow_unstable=allow_unstable)
+        design, plan = _flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
         design = with_trade_off(design)
         there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
         taken_over = there is not None and bool(there.taken_over())
@@ -145,17 +146,14 @@ def fly(
     raise typer.Exit(INTERRUPTED if summary.reason.startswith("interrupted") else 0 if passed else FAILED)
 
 
-def _flyable(file: Path, plan: "FlightPlan", *, allow_unstable: bool) -> "FlightPlan":
-    """The plan as it is flown; an unstable one is refused, or the user is warned."""
+def _flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable: bool) -> "tuple[Design, FlightPlan]":
+    """Design and plan as they are flown; an unstable loop is refused, or the user is warned."""
     from gcs.drive import preflight
-    from gcs.plan.loops import unstable_together
 
     if (unstable := preflight.unstable_loop(plan)) is not None:
         options.refuse_or_warn(file, unstable, allow=allow_unstable)
-        return preflight.without_actions(plan)
-    if together := unstable_together(plan):
-        options.warn(file, f"{together}, by prediction")
-    return plan
+        return design, preflight.without_actions(plan)
+    return options.over_own_links(file, design, plan)
 
 
 def _refuse_unusable(

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from gcs.drive.guard import Guard
     from gcs.drive.mirror import Mirror
     from gcs.drive.udp import StationSocket
+    from gcs.plan.design import Design
+    from gcs.plan.flight_plan import FlightPlan
     from scenarios.schema import Scenario
 
 
@@ -156,6 +158,19 @@ def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
 
 def warn(file: Path, finding: str) -> None:
     print(f"warning: {file}: {finding}", file=sys.stderr)
+
+
+def over_own_links(file: Path, design: "Design", plan: "FlightPlan") -> "tuple[Design, FlightPlan]":
+    """Design and plan with their margins over the scenario's own links; says so if that changes them."""
+    from gcs.plan.planner import over_own_links as changed
+    from gcs.views.console import ms_text
+
+    design, flown = changed(design, plan)
+    if flown is not plan:
+        own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)
+        finding = f"the margin is {own} for the slowest of them, {alike} if links were alike"
+        warn(file, f"vehicles share a loop over links that differ: {finding}")
+    return design, flown
 
 
 def out_folder(out: Path, wanted: str = "a new or empty folder", option: str = "--out") -> Path:

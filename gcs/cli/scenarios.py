@@ -125,6 +125,8 @@ def check(
     design, plan = flight_plan(scenario, measured)
     if (unstable := preflight.unstable_loop(plan)) is not None:
         options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+    else:
+        design, plan = options.over_own_links(scenario_file, design, plan)
     found = checked(plan)
     options.answer(found, partial(_print_check, design), as_json=as_json)
     if assert_headroom is not None:

@@ -12,7 +12,7 @@ from gcs.plan.design import CodeRecord
 from gcs.plan.expected_delay import expected_loop_delays_s, late_loop_delay_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
-from gcs.plan.loops import link_delays_left_s, links_differ, plan_loops, shared_headroom
+from gcs.plan.loops import link_delays_left_s
 from gcs.plan.own_law import code_by_key
 from gcs.published import Published
 from scenarios.schema import Scenario
@@ -78,11 +78,10 @@ class ScenarioCheck(Published):
     """The least and the largest loop delay at which the predicted loop is stable; None without prediction, or if there
     is no largest."""
     headroom: float | None
-    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. If vehicles
-    share a loop over unlike links, 1 - 1/f where it breaks at f times its loop delays. None without any margin."""
+    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
+    any margin."""
     loop_delay_s_p99: float | None
-    """The loop delay that 99 % of the set-points keep, over the slowest links; None with prediction, on board, or if
-    vehicles share a loop over unlike links."""
+    """The loop delay that 99 % of the set-points keep, over the slowest links; None with prediction or on board."""
     headroom_p99: float | None
     """The headroom at that delay."""
     closest_m: float | None
@@ -115,12 +114,6 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
     commands = plan.gain @ errors
     limits, delays_s = scenario.limits, expected_loop_delays_s(scenario)
-    shared = {
-        own: shared_headroom(plan, block)
-        for block in plan_loops(plan)
-        if links_differ(plan, block)
-        for own in block.system_ids
-    }
     left_s = link_delays_left_s(plan) if scenario.control.prediction != "measured" else {}
     vehicles: list[VehicleCheck] = []
     for row, vehicle in enumerate(ordered):
@@ -138,7 +131,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
                 expected_loop_delay_s=delays_s[own],
-                headroom=_known(shared.get(own, headroom(used_s, margin_s))),
+                headroom=_known(headroom(used_s, margin_s)),
                 link_delay_left_s=_known(left_s.get(own, margin_s - used_s)),
             )
         )
@@ -157,8 +150,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         assumed_delay_s=assumed_s if is_predicted else None,
         mismatch_window_s=window_s if is_predicted and margin_s < inf else None,
         headroom=min((left for own in vehicles if (left := own.headroom) is not None), default=None),
-        loop_delay_s_p99=None if shared else late_s,
-        headroom_p99=None if late_s is None or shared else _known(headroom(late_s, margin_s)),
+        loop_delay_s_p99=late_s,
+        headroom_p99=None if late_s is None else _known(headroom(late_s, margin_s)),
         closest_m=None if nearest is None else nearest.distance_m,
         closest_s=None if nearest is None else nearest.time_s,
         course=_course(scenario) if scenario.course.is_smooth else None,

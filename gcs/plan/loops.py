@@ -6,6 +6,7 @@ little: such a loop may break far below it or stand far above. What counts then 
 """
 
 from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
 from math import inf, isnan, nan
 
 from gains.performance.response import formation_loop, response_states
@@ -19,7 +20,7 @@ _STEP, _STEPS = 0.1, 100
 """Steps, in margins of the whole loop, in which the edge of a shared loop is searched, and their number."""
 _HALVINGS = 8
 _MOST_SHARING = 6
-"""Most vehicles of a shared loop whose links are searched one by one, which takes seconds."""
+"""Most vehicles of a shared loop over whose links it is searched, which takes seconds."""
 
 
 def is_modelled(plan: FlightPlan) -> bool:
@@ -105,9 +106,9 @@ def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int
 def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
     """Whether vehicles share this loop over links that differ, so that its margin says little, and a model knows more.
 
-    None does with loops on board or prediction.
+    None does with loops on board or prediction, or of many vehicles.
     """
-    if block.carried is None or not is_modelled(plan):
+    if block.carried is None or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
     delays_s = expected_loop_delays_s(plan.scenario)
     return len({delays_s[own] for own in block.system_ids}) > 1
@@ -127,16 +128,24 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
     return left_s
 
 
-def unstable_together(plan: FlightPlan) -> str:
-    """What the scenario's links make unstable among the loops that vehicles share; empty if nothing."""
-    for block in [] if plan.separable else plan_loops(plan):
-        if links_differ(plan, block) and growth_1_s(block, expected_loop_delays_s(plan.scenario)) >= 0.0:
-            return f"vehicles {' '.join(map(str, block.system_ids))} share a loop that their links make unstable"
-    return ""
+def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
+    """The margin (s) of each of the plan's gains over the scenario's links; None where those for equal delays serve.
+
+    They do unless vehicles share a loop over links that differ. Then the margin counts for the slowest of them.
+    """
+    if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
+        return None
+    expected_s, margins_s = expected_loop_delays_s(plan.scenario), list[float]()
+    for each in (replace(plan, gain=K) for K in plan.gains):
+        margins_s.append(inf)
+        for block in plan_loops(each):
+            differ, slowest_s = links_differ(each, block), max(expected_s[own] for own in block.system_ids)
+            margins_s[-1] = min(margins_s[-1], slowest_s * breaking_factor(each, block) if differ else block.margin_s())
+    return tuple(margins_s)
 
 
-def shared_headroom(plan: FlightPlan, block: CoupledBlock) -> float:
-    """The headroom of a loop that vehicles share: 1 − 1/f if it breaks at f times its expected loop delays."""
+def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
+    """How many times its expected loop delays a loop takes that vehicles share; 0 if it is unstable at any."""
     expected_s = expected_loop_delays_s(plan.scenario)
     own_s = {own: expected_s[own] for own in block.system_ids}
 
@@ -144,5 +153,4 @@ def shared_headroom(plan: FlightPlan, block: CoupledBlock) -> float:
         return growth_1_s(block, {own: factor * at_s for own, at_s in own_s.items()})
 
     stable, step = growth(1.0) < 0.0, _STEP * block.margin_s() / max(own_s.values())
-    edge = _edge_s(growth, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)
-    return 1.0 - 1.0 / edge if edge > 0.0 else -inf
+    return _edge_s(growth, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)

@@ -41,6 +41,7 @@ from gcs.plan.flight_plan import (
 )
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.given import gain_blocks
+from gcs.plan.loops import margins_over_links_s
 from gcs.plan.mismatch import assumption, continuous_window, proved_jump_s, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
@@ -124,6 +125,20 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     )
     whole = Design.model_validate(first.to_dict() | {"schedule": schedule} | parts)
     return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
+    """Design and plan with their margins over the scenario's links, where vehicles share a loop over links that differ.
+
+    Otherwise, and for vehicles whose response is not known yet, they stay as they are.
+    """
+    known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
+    margins_s = margins_over_links_s(plan) if known else None
+    if margins_s is None:
+        return design, plan
+    continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
+    flown = design.with_schedule(_with_margins(design, margins_s, continuous_s))
+    return flown, plan.with_margins(margins_s, plan.responses)
 
 
 def with_trade_off(design: Design) -> Design:

@@ -12,7 +12,7 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
 from gcs.errors import InputError
 from gcs.plan.design import Design
-from gcs.plan.planner import described, flight_plan
+from gcs.plan.planner import described, flight_plan, over_own_links
 from gcs.runs.record import END
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
@@ -130,6 +130,8 @@ def fly_virtual(
         if not allow_unstable:
             raise InputError(f"{scenario.name}: {unstable}")
         plan = without_actions(plan)
+    else:
+        design, plan = over_own_links(design, plan)
     station = Station(plan, start_ns=START_NS)
     ticks = in_sequence([*fly_lockstep(plan, station=station, ahead=True)]).reshape(-1, len(station.vehicles))
     if station.plan is not plan:

@@ -5,11 +5,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from gcs import fly_virtual
 from gcs.cli.main import app
 from gcs.drive.check import check
 from gcs.errors import InputError
-from gcs.plan.loops import plan_loops, unstable_together
-from gcs.plan.planner import flight_plan
+from gcs.plan.loops import plan_loops
+from gcs.plan.planner import flight_plan, over_own_links
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from scenarios.files import dump, load, parse
@@ -130,16 +131,33 @@ def test_a_check_has_the_headroom_of_each_vehicle() -> None:
 def test_a_shared_loop_may_break_far_below_its_margin() -> None:
     """Both look at each other. If links are alike they take 630 ms of loop delay; one alone takes 363 ms."""
     scenario = with_links(parse(EACH_OTHER, Path("each_other.toml")), all=0.0, v2=0.285)
-    plan = study_of(scenario).plan
-    found = check(plan)
+    design, plan = flight_plan(scenario)
+    flown, plan_flown = over_own_links(design, plan)
+    found = check(plan_flown)
     _, follower = found.vehicles
     assert plan.delay_margin_s > 0.6 > follower.expected_loop_delay_s
+    assert flown.delay_margin_s == plan_flown.delay_margin_s == pytest.approx(0.365, abs=0.005)
     assert found.headroom is not None
     assert found.headroom < -0.5
-    assert "share a loop that their links make unstable" in unstable_together(plan)
     assert follower.expected_loop_delay_s + (follower.link_delay_left_s or 0.0) == pytest.approx(0.3635, abs=4e-3)
     onset = onset_of(scenario, 2)  # from a link that is past it
     assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # 4e-5
     assert onset.link_delay_left_s is not None
     assert onset.link_delay_left_s < -0.2
-    assert unstable_together(study_of(with_links(scenario, all=0.1)).plan) == ""
+    alike = flight_plan(with_links(scenario, all=0.1))
+    assert over_own_links(*alike) == alike
+
+
+def test_flight_and_headroom_agree_over_links_that_differ() -> None:
+    """Below the margin of equal links one formation flies apart; past it, another is stable."""
+    apart = fly_virtual(with_links(parse(EACH_OTHER, Path("each_other.toml")), all=0.0, v2=0.285)).summary
+    assert (apart.verdict, apart.delay_margin_s) != ("stable", pytest.approx(0.63, abs=0.01))
+    assert apart.headroom_min is not None
+    assert apart.headroom_min < -0.5
+    watched = load(located("chain3_bidirectional")).with_calm_monitor()
+    together = fly_virtual(with_links(watched, all=0.02, v2=0.17)).summary
+    assert together.verdict == "stable"
+    assert together.headroom_min is not None
+    assert 0.1 < together.headroom_min < 0.2
+    assert together.loop_delay_s.max is not None
+    assert together.loop_delay_s.max > flight_plan(watched)[1].delay_margin_s
