@@ -75,9 +75,9 @@ def monitor(
     networks = [0] if scenario is None else networks_of(vehicle.system_id for vehicle in scenario.vehicles)
     with options.listening("--listen", listen, options.opened_guard(key, role="monitor"), networks) as link:
         if scenario is not None and given is None:
-            from gcs.plan.planner import flight_plan
+            from gcs.plan.planner import flight_plan, over_own_links
 
-            given, margin_of = flight_plan(scenario)[0], f"of {scenario.name}'s gains"
+            given, margin_of = over_own_links(*flight_plan(scenario))[0], f"of {scenario.name}'s gains"
         # Imported after the socket is open: datagrams that arrive during the imports keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
@@ -152,9 +152,9 @@ def replay(
     if given is not None:
         there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
-        from gcs.plan.planner import flight_plan
+        from gcs.plan.planner import flight_plan, over_own_links
 
-        there = replace(there, design=flight_plan(there.scenario)[0])
+        there = replace(there, design=over_own_links(*flight_plan(there.scenario))[0])
     options.answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
     if save_links is not None:
         from gcs.watch.saved_links import recorded
