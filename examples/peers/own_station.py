@@ -11,12 +11,13 @@ from plain import ordered, report
 
 from gcs.control.phases import Phase
 from gcs.drive.lockstep import prepare
-from gcs.drive.udp import StationSocket, clock_ns, drive, undisturbed
+from gcs.drive.udp import StationSocket, clock_ns, drive
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_ticks
 from gcs.runs.record import RunWriter
 from gcs.station.station import Station
 from scenarios.schema import NS_PER_S
+from scenarios.undisturbed import undisturbed
 
 
 def main() -> None:

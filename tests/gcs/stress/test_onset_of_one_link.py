@@ -69,15 +69,14 @@ def test_a_link_alone_breaks_its_loop_at_the_loops_margin() -> None:
     assert (onset.vehicle, onset.critical, onset.loop) == (2, 2, (2,))
 
 
-@pytest.mark.parametrize("vehicle", [1, 2])
-def test_a_loop_with_unlike_links_breaks_where_its_model_does(vehicle: int) -> None:
-    """A platoon that looks back as well. A model without extrapolation is 7 and 13 % off."""
+def test_a_loop_with_unlike_links_breaks_where_its_model_does() -> None:
+    """A platoon that looks back as well. A model without extrapolation is 13 % off."""
     scenario = with_links(load(located("chain3_bidirectional")), all=0.02)
-    onset = onset_of(scenario, vehicle)
+    onset = onset_of(scenario, 2)
     assert onset.predicted_s is not None
     assert onset.loop == (1, 2, 3)
     assert onset.loop_delay_s > 1.3 * study_of(scenario).plan.delay_margin_s  # alone, a link may be slower than all
-    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=1.5e-3)  # 7e-4 and 1e-4
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=5e-4)  # 1e-4
 
 
 def test_states_of_one_age_leave_one_delay_for_each_command() -> None:
