@@ -44,7 +44,11 @@ def array_kernel(function: F) -> F:
 
 
 def at_row(run: Callable[Concatenate[Record, P], T]) -> Callable[Concatenate[Records, int, P], T]:
-    """A kernel as Python calls it: with an array of records and a row in place of the record that it works on."""
+    """A kernel as Python calls it: with an array of records and a row in place of the record that it works on.
+
+    Each is a function of its own, `_at_row` with its kernel in place of the global `_run`, for the compiler knows
+    kernels only as globals.
+    """
     inner: Any = run
     outer = FunctionType(_at_row.__code__, {"_run": run}, "_at_row")
     outer.__module__, _, name = inner._name.rpartition(".")

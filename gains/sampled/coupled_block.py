@@ -15,7 +15,7 @@ from gains.core.arrays import FloatArray
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
-from gains.sampled._carried import CarriedStates, carried_states
+from gains.sampled._extrapolated import ExtrapolatedLoop, extrapolated_loop
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
@@ -102,8 +102,8 @@ class CoupledBlock:
     """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
 
     `system_ids` names the vehicles and `loop` is their feedback; `assumed_s` is the loop delay over which the station
-    predicts, None without prediction. `carried` is the same loop where links differ, of vehicles whose loops the
-    station closes without prediction.
+    predicts, None without prediction. `extrapolated` is the same loop with a state of each age, for vehicles that
+    share a loop which the station closes without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -113,7 +113,7 @@ class CoupledBlock:
     timing: Timing
     loop: ClosedLoop
     assumed_s: float | None = None
-    carried: CarriedStates | None = None
+    extrapolated: ExtrapolatedLoop | None = None
 
     @property
     def has_late_terms(self) -> bool:
@@ -136,9 +136,9 @@ class CoupledBlock:
         `age_s` has the ages of the states when the station uses them. Without them all states that a command uses are
         taken as of one instant.
         """
-        if age_s is not None and self.carried is not None:
+        if age_s is not None and self.extrapolated is not None:
             delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
-            return self.carried.growth_1_s(delays_s, [age_s[system_id] for system_id in self.system_ids])
+            return self.extrapolated.growth_1_s(delays_s, [age_s[system_id] for system_id in self.system_ids])
         known, late = self.loop.continuous_terms()
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
         entries, commands = (
@@ -150,13 +150,14 @@ class CoupledBlock:
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> float:
         """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.
 
-        Exact if the delays are equal. Otherwise it is the rate at their mean, plus what their differences add in the
-        continuous model. `age_s` as of `growth_continuous_at_1_s`.
+        Exact if delays and ages are equal. Otherwise it is the rate at the mean delay, plus what the differences add in
+        the continuous model. `age_s` as of `growth_continuous_at_1_s`.
         """
         delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
+        ages_s = {(age_s or {}).get(system_id) for system_id in self.system_ids}
         mean_s = sum(delays_s) / len(delays_s)
         rate_1_s = self.loop.growth_1_s(mean_s)
-        if max(delays_s) == min(delays_s):
+        if max(delays_s) == min(delays_s) and len(ages_s) == 1:
             return rate_1_s
         differing_1_s = self.growth_continuous_at_1_s(loop_delay_s, age_s)
         return rate_1_s + differing_1_s - self.growth_continuous_1_s(mean_s)
@@ -207,9 +208,10 @@ def coupled_blocks(
             loop = whole.part(own)
         elif assumed_s is not None:
             loop = PredictedLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
-        differ = len(members) > 1 and isinstance(loop, GroundLoop)
-        carried = carried_states(model, members, *matrices) if differ else None
-        blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s, carried))
+        shared = len(members) > 1 and isinstance(loop, GroundLoop)
+        of_positions = extrapolated_loop(model, members, *matrices) if shared else None
+        ids = tuple(system_ids[i] for i in members)
+        blocks.append(CoupledBlock(ids, *matrices, timing, loop, assumed_s, of_positions))
     return blocks
 
 

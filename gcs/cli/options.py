@@ -162,10 +162,10 @@ def warn(file: Path, finding: str) -> None:
 
 def over_own_links(file: Path, design: "Design", plan: "FlightPlan") -> "tuple[Design, FlightPlan]":
     """Design and plan with their margins over the scenario's own links; says so if that changes them."""
-    from gcs.plan.planner import over_own_links as changed
+    from gcs.plan import planner
     from gcs.views.console import ms_text
 
-    design, flown = changed(design, plan)
+    design, flown = planner.over_own_links(design, plan)
     if flown is not plan:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)
         finding = f"the margin is {own} for the slowest of them, {alike} if links were alike"

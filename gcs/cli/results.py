@@ -100,10 +100,10 @@ def _against(result: CampaignResult, onset: Onset) -> str:
     if onset.difference is None:
         return "with no margin to compare it with"
     limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
-    shared = ""
+    limit = f"{limit} of this loop"
     if onset.vehicle is not None and len(onset.loop) > 1:
-        shared = f", which vehicles {' '.join(map(str, onset.loop))} share"
-    return f"{onset.difference:+.3%} from the {limit} of this loop{shared}: {_ms(onset.predicted_s)}"
+        limit = f"model of the loop that vehicles {' '.join(map(str, onset.loop))} share over links that differ"
+    return f"{onset.difference:+.3%} from the {limit}: {_ms(onset.predicted_s)}"
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:

@@ -46,7 +46,7 @@ class Alterable(Protocol):
     def alter(self, due_ns: int, by_m_s2: complex) -> None: ...
 
 
-def _carried(vector: Sequence[float]) -> complex:
+def _extrapolated(vector: Sequence[float]) -> complex:
     """North + 1j * east as the link carries it."""
     return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*vector)))
 
@@ -80,8 +80,8 @@ class ActiveTargets:
     def sent(self, due_ns: int, velocity_m_s: Sequence[float], acceleration_m_s2: Sequence[float]) -> None:
         """Remember a set-point as it was sent, north and east; `history` must hold it already."""
         self._due_ns.append(due_ns)
-        self._velocity.append(_carried(velocity_m_s))
-        self._acceleration.append(_carried(acceleration_m_s2))
+        self._velocity.append(_extrapolated(velocity_m_s))
+        self._acceleration.append(_extrapolated(acceleration_m_s2))
         self._off.append(0j)
         self._clip_from(len(self._off) - 1)
         old = bisect_left(self._due_ns, due_ns - 9 * self._held_ns)
@@ -90,13 +90,13 @@ class ActiveTargets:
 
     def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
         """Take in the fields of a report; `at_ns` is its instant on the station's clock."""
-        acceleration, only = _carried(fields[_ACCELERATION]), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
+        acceleration, only = _extrapolated(fields[_ACCELERATION]), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
         recent = range(oldest, bisect_right(self._due_ns, at_ns))
         value, same = acceleration, [place for place in recent if _is_same(acceleration, self._acceleration[place])]
         if not same and not only:
-            value = _carried(fields[_VELOCITY])
+            value = _extrapolated(fields[_VELOCITY])
             same = [place for place in recent if _is_same(value, self._velocity[place])]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
             # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages

@@ -113,7 +113,7 @@ class StreamPrediction:
             sum((self._response(k, at_ns - delay_ns) for k, delay_ns in late), np.zeros(model.states))
             for at_ns in (used_ns, acts_ns)
         )
-        z = self._flow.carried(z - before, acts_ns - used_ns) + after
+        z = self._flow.extrapolated(z - before, acts_ns - used_ns) + after
         return acts_ns, (self._age_ns[row] + own_ns) * 1e-9, self._places(z, needed)
 
     def _places(self, z: FloatArray, needed: Sequence[int]) -> list[State]:

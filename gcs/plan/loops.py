@@ -108,7 +108,7 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
     None does with loops on board or prediction, or of many vehicles.
     """
-    if block.carried is None or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
+    if block.extrapolated is None or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
     delays_s = expected_loop_delays_s(plan.scenario)
     return len({delays_s[own] for own in block.system_ids}) > 1
@@ -121,7 +121,7 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
         for system_id in block.system_ids:
             alone = len(block.system_ids) == 1
             key = block.kind if alone else system_id
-            known = alone or (block.carried is not None and len(block.system_ids) <= _MOST_SHARING)
+            known = alone or (block.extrapolated is not None and len(block.system_ids) <= _MOST_SHARING)
             if key not in windows:
                 windows[key] = window_of(plan, system_id) if known else (0.0, nan)
             left_s[system_id] = windows[key][1] - expected_s[system_id]

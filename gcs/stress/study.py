@@ -80,12 +80,13 @@ class Onset:
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
     down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
-    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1. `vehicle` is
-    the vehicle whose link alone was slowed, which is then the one meant everywhere here, and `link_delay_left_s` how
-    much longer its link delay may be than in the scenario; both are None if all links were slowed alike. `loop` has the
-    vehicles of the loop that breaks.
+    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
     `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. None where there is
     no model: of a law that is not linear, or of dynamics of one's own.
+
+    `loop` has the vehicles of the loop that breaks. `vehicle` is the one whose link alone was slowed: all delays are
+    then its own, and `link_delay_left_s` is how much longer its link delay may be than in the scenario. Both are None
+    if all links were slowed alike.
     """
 
     loop_delay_s: float

@@ -125,7 +125,10 @@ def plan_of(trial: Trial) -> FlightPlan:
         K[row, column] = value
     scenario = trial.scenario.with_calm_monitor()
     law = law_of(scenario)
-    return FlightPlan(scenario, formation, K, trial.delay_margin_s, responses=trial.responses, law=law)
+    separable = len(formation.model.coupled_vehicles(K)) == formation.model.vehicles
+    return FlightPlan(
+        scenario, formation, K, trial.delay_margin_s, separable=separable, responses=trial.responses, law=law
+    )
 
 
 def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

@@ -107,6 +107,7 @@ def fly_virtual(
 
     `scenario` is a scenario, its file, or the name of one that ships (`gcs scenarios`). Gains whose loop is unstable
     even without delay are flown if `allow_unstable`, and the Python code that a scenario names is run if `allow_code`.
+    Vehicles that share a loop over links that differ have the margin of these links (`gcs.plan.planner`).
 
     Raises scenarios.errors.ScenarioError if the file is not a scenario, gcs.errors.InputError if `gcs fly` would refuse
     it, and gains.GainsError if its requirement cannot be met.

@@ -59,7 +59,7 @@ ACCELERATIONS = st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
     st.integers(-1000, 5000),
     st.integers(0, 10_000),
 )
-def test_states_are_carried_on_as_if_each_piece_were_integrated(
+def test_states_are_extrapolated_on_as_if_each_piece_were_integrated(
     steps: list[tuple[int, tuple[float, float]]], from_ms: int, for_ms: int
 ) -> None:
     due_ms = np.cumsum([gap_ms for gap_ms, _ in steps]).tolist()

@@ -77,6 +77,7 @@ def test_a_loop_with_unlike_links_breaks_where_its_model_does() -> None:
     assert onset.loop == (1, 2, 3)
     assert onset.loop_delay_s > 1.3 * study_of(scenario).plan.delay_margin_s  # alone, a link may be slower than all
     assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=5e-4)  # 1e-4
+    assert [own.verdict for own in onset.own] == ["stable", "unstable"]  # both past the margin of equal links
 
 
 def test_states_of_one_age_leave_one_delay_for_each_command() -> None:

@@ -1,13 +1,13 @@
-"""Vehicles of one loop whose links differ: the station carries the states of slower links forward.
+"""Vehicles that share a loop over links that differ: the station extrapolates the states of the slower links.
 
 A command of vehicle i acts tau_i after its state was sampled. The states of others that it uses are brought to the
-instant of that sample. One that is older, delta_ij = max(0, a_j − a_i) with a the age of the newest states at the
-station, is extrapolated at constant velocity; one that is newer is interpolated between reports. Hence
+instant of that sample. One that is older by delta_ij = max(0, a_j − a_i), where a is the age of a vehicle's newest
+state at the station, is extrapolated at constant velocity; a newer one is interpolated between reports. Hence
 
     u_i(t) = sum_j G_ij (p_j + delta_ij v_j, v_j)(t − tau_i − delta_ij)
 
-in positions p and velocities v of the vehicles. The ages are those that the station believes: an error of its estimate
-of vehicle j's clock shifts j in time for all others alike, and back for j's own commands, which moves no root.
+in positions p and velocities v of the vehicles. The ages are those that the station believes. An error of its estimate
+of vehicle j's clock shifts j in time for the commands of all others, and back for j's own, which moves no root.
 """
 
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ from gains.delay.rightmost import rightmost_roots
 from gains.formation.model import FormationModel
 
 _AT_ZERO = 1e-6
-"""A root (1/s) nearer to zero is the formation's freedom to be anywhere, which the positions bring with them."""
+"""A root (1/s) nearer to zero than this is that of the formation's position, which nothing controls."""
 
 
 @dataclass(frozen=True, eq=False)
-class CarriedStates:
+class ExtrapolatedLoop:
     """x' = A x + B u, u = G x: positions and velocities of the vehicles of a block, then what else moves them.
 
     `positions` and `velocities` have the places of each vehicle's in x, (vehicles, axes), `inputs` those in u.
@@ -57,12 +57,12 @@ class CarriedStates:
         return float(max(root.real for root in roots if abs(root) > _AT_ZERO))
 
 
-def carried_states(
+def extrapolated_loop(
     model: FormationModel, members: Sequence[int], A: FloatArray, B: FloatArray, K: FloatArray
-) -> CarriedStates:
-    """The members of a formation that share a loop: e' = A e + B u, u = K e in positions instead of spacing errors.
+) -> ExtrapolatedLoop:
+    """The loop e' = A e + B u, u = K e that members of a formation share, in positions instead of spacing errors.
 
-    The states are the errors of each member in turn, and whatever follows them.
+    e has the errors of each member in turn, then the states of their responses.
     """
     step, at = np.arange(model.axes), 0
     spacing, velocities = dict[int, IntArray](), list[IntArray]()
@@ -90,4 +90,4 @@ def carried_states(
     moved[positions, own_velocities] = 1.0
     entry[place[others]] = B[others]
     inputs = np.arange(B.shape[1]).reshape(positions.shape)
-    return CarriedStates(moved, entry, K @ error_of, positions, own_velocities, inputs)
+    return ExtrapolatedLoop(moved, entry, K @ error_of, positions, own_velocities, inputs)
