@@ -288,6 +288,7 @@ def _found(
     at_onset = slowed.at(round(link_s, 6))
     others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
+    others = [own for own in others if vehicle is None or own not in block.system_ids]
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     # with prediction, stay away from the other end of the window
     aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
