@@ -168,7 +168,7 @@ class _Flow:
         """z after a time under a constant u."""
         return self._on(np.concatenate([z, u]), duration_ns)[: self._n]
 
-    def carried(self, z: FloatArray, duration_ns: int) -> FloatArray:
+    def extrapolated(self, z: FloatArray, duration_ns: int) -> FloatArray:
         """e^{A t} z."""
         return self.pushed(z, np.zeros(len(self._generator) - self._n), duration_ns)
 
