@@ -7,11 +7,14 @@ The docstring below a key describes it in `scenario.schema.json` and the referen
 """
 
 from collections.abc import Callable
+from math import inf
+from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
+from scenarios.errors import ScenarioError
 from scenarios.keys.autopilot import DeadTime, Response, Sitl
 from scenarios.keys.course import Course, FormationChange
 from scenarios.keys.criteria import Criteria, Overlap
@@ -425,8 +428,11 @@ class Scenario(Part):
     def with_link_delay(self, *, up_s: float | None, down_s: float | None) -> Self:
         """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is.
 
-        Delay points are dropped; jitter, losses and channels stay.
+        Delay points are dropped; jitter, losses and channels stay. ScenarioError unless a delay is a number from 0.
         """
+        for key, value in (("up_s", up_s), ("down_s", down_s)):
+            if value is not None and not 0.0 <= value < inf:
+                raise ScenarioError(Path(self.name), key, value, "a delay in seconds, from 0")
 
         def delayed(delay_s: float | None) -> Callable[[Link], Link]:
             changed = {} if delay_s is None else {"delay_s": delay_s, "delay_points": ()}

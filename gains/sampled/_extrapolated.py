@@ -39,7 +39,12 @@ class ExtrapolatedLoop:
 
     def growth_1_s(self, delays_s: Sequence[float], ages_s: Sequence[float]) -> float:
         """Real part (1/s) of the rightmost root with these tau and a (s) of the vehicles."""
-        vehicles, axes = self.inputs.shape
+        roots = rightmost_roots(self.terms(delays_s, ages_s), 1 + self.inputs.shape[1])
+        return float(max(root.real for root in roots if abs(root) > _AT_ZERO))
+
+    def terms(self, delays_s: Sequence[float], ages_s: Sequence[float]) -> list[tuple[FloatArray, float]]:
+        """Pairs (A, d) of x'(t) = sum A x(t - d) with these tau and a (s) of the vehicles."""
+        vehicles = len(self.inputs)
         terms: list[tuple[FloatArray, float]] = [(self.A, 0.0)]
         for i in range(vehicles):
             entry = self.B[:, self.inputs[i]]
@@ -53,8 +58,7 @@ class ExtrapolatedLoop:
                 term[:, self.velocities[j]] = from_velocity + older_s * from_position
                 if term.any():
                     terms.append((term, delays_s[i] + older_s))
-        roots = rightmost_roots(terms, 1 + axes)
-        return float(max(root.real for root in roots if abs(root) > _AT_ZERO))
+        return terms
 
 
 def extrapolated_loop(

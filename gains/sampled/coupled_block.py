@@ -6,20 +6,27 @@ vehicle is a block of its own. The formation is stable exactly when every block 
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from math import isfinite
 from typing import Protocol
 
 import numpy as np
 from numpy.linalg import pinv
 
 from gains.core.arrays import FloatArray
+from gains.core.errors import DisagreementError
+from gains.delay._mixed import count_unstable_roots
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.sampled._extrapolated import ExtrapolatedLoop, extrapolated_loop
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
+from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop, streamed_loop
 from gains.sampled.prediction import checked_mask, mismatch_window, mismatch_window_continuous, predicted_growth_rate
+
+_SHIFT_1_S = 1e-6
+"""Roots count as unstable right of this: those at zero of the formation's position, which nothing controls, do not."""
 
 
 class ClosedLoop(Protocol):
@@ -120,6 +127,14 @@ class CoupledBlock:
         """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
         return bool(self.loop.continuous_terms()[1].any())
 
+    @property
+    def takes_unlike_delays(self) -> bool:
+        """Whether `growth_at_1_s` holds where the vehicles' links differ: not with prediction.
+
+        With the loop on board it does without the ages: all states that a command uses are those of one instant.
+        """
+        return len(self.system_ids) == 1 or self.extrapolated is not None or isinstance(self.loop, OnboardLoop)
+
     def margin_s(self) -> float:
         """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""
         return self.loop.window_s()[1]
@@ -136,16 +151,44 @@ class CoupledBlock:
         `age_s` has the ages of the states when the station uses them. Without them all states that a command uses are
         taken as of one instant.
         """
-        if age_s is not None and self.extrapolated is not None:
-            delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
-            return self.extrapolated.growth_1_s(delays_s, [age_s[system_id] for system_id in self.system_ids])
-        known, late = self.loop.continuous_terms()
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
+        if age_s is not None and self.extrapolated is not None:
+            return self.extrapolated.growth_1_s(delays_s, [age_s[system_id] for system_id in self.system_ids])
+        return rightmost_root(self._terms(delays_s)).real
+
+    def is_stable_at(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> bool:
+        """Whether the sampled loop is stable where each vehicle has a loop delay of its own.
+
+        The continuous model tells, in which the hold counts as the delay with which equal links have the margin of the
+        sampled loop. `age_s` as of `growth_continuous_at_1_s`. A thousand times as fast as the growth over long links.
+        """
+        delays_s = [loop_delay_s[system_id] + self._hold_s for system_id in self.system_ids]
+        if age_s is not None and self.extrapolated is not None:
+            terms = self.extrapolated.terms(delays_s, [age_s[system_id] for system_id in self.system_ids])
+        else:
+            terms = self._terms(delays_s)
+        shifted = [(np.exp(_SHIFT_1_S * delay_s) * A, delay_s) for A, delay_s in terms]
+        shifted.append((-_SHIFT_1_S * np.eye(len(terms[0][0])), 0.0))
+        try:
+            return count_unstable_roots(shifted) == 0
+        except DisagreementError:  # at the edge
+            return False
+
+    @cached_property
+    def _hold_s(self) -> float:
+        """The delay (s) that stands for the hold: with it the continuous model has the sampled margin."""
+        continuous_s, sampled_s = self.loop.window_continuous_s()[1], self.margin_s()
+        shorter_s = continuous_s - sampled_s if isfinite(continuous_s - sampled_s) else 0.0
+        return self.timing.held_s / 2.0 + shorter_s
+
+    def _terms(self, delays_s: Sequence[float]) -> list[tuple[FloatArray, float]]:
+        """Pairs (A, d) of the continuous model with a delay (s) for the command of each vehicle."""
+        known, late = self.loop.continuous_terms()
         entries, commands = (
             np.split(part, len(delays_s), axis) for part, axis in ((self.B, 1), (pinv(self.B) @ late, 0))
         )
         own = [B @ command for B, command in zip(entries, commands, strict=True)]
-        return rightmost_root([*known, *zip(own, delays_s, strict=True)]).real
+        return [*known, *zip(own, delays_s, strict=True)]
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> float:
         """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.

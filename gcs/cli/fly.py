@@ -27,12 +27,7 @@ def fly(
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
     links_of: LinksOf = None,
-    link_delay: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS", help="constant delay of every link, each way; --delay of gcs stress is up + down"
-        ),
-    ] = None,
+    link_delay: options.LinkDelayOption = None,
     without: Annotated[
         list[int] | None,
         typer.Option(metavar="ID", help="leave this vehicle out and fly the formation around it; may be repeated"),
@@ -83,12 +78,12 @@ def fly(
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
-    _refuse_unusable(link_delay, assert_headroom, assert_settled, junit, out)
+    _refuse_unusable(assert_headroom, assert_settled, junit, out)
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
     _refuse_contradictions(sockets, speed, live, virtual=virtual, mirror_commands=mirror_commands)
-    scenario = options.load_scenario(scenario_file, loop, without, links=links, allow_code=allow_code)
-    if link_delay is not None:
-        scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
+    scenario = options.load_scenario(
+        scenario_file, loop, without, links=links, link_delay_s=link_delay, allow_code=allow_code
+    )
     if connect is None:
         options.refuse(scenario_file, preflight.bad_start(scenario))
         options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
@@ -157,7 +152,6 @@ def _flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable
 
 
 def _refuse_unusable(
-    link_delay_s: float | None,
     least_headroom: float | None,
     settled_s: float | None,
     junit: Path | None,
@@ -165,8 +159,6 @@ def _refuse_unusable(
 ) -> None:
     if out is not None:
         options.refuse_out(out)
-    if link_delay_s is not None:
-        options.within("--link-delay", link_delay_s, 0, 60, "seconds")
     options.refuse_headroom(least_headroom)
     if settled_s is not None:
         options.within("--assert-settled", settled_s, 0.0, 1e6, "seconds")
@@ -208,6 +200,8 @@ def _refuse_contradictions(
         from gcs.views.viewer import refuse_without_viewer
 
         refuse_without_viewer()
+        if live != "new":
+            options.address("--live", live)
     if mirror_commands and sockets["--mirror"] is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
     if sockets["--connect"] is not None and sockets["--listen"] is not None:

@@ -79,7 +79,7 @@ def main() -> None:
     except (InputError, ScenarioError, GainsError, KeyFileError) as error:
         code = _bad_input(str(error))
     except typer.TyperException as error:  # an unknown option, a missing argument
-        code = _bad_input(_misread(error) if isinstance(error, typer.BadParameter) else str(error))
+        code = _bad_input(_misread(error))
     except ModuleNotFoundError as error:
         if not extra_wanted(error.name):
             raise
@@ -98,10 +98,14 @@ def main() -> None:
     sys.exit(code if isinstance(code, int) else 0)
 
 
-def _misread(error: typer.BadParameter) -> str:
-    """What was read and what was wanted, where a value is of the wrong kind."""
+def _misread(error: typer.TyperException) -> str:
+    """What was read and what was wanted, where a value is of the wrong kind or an option is misspelt."""
     from pydantic import ValidationError
 
+    if near := getattr(error, "possibilities", None):
+        return f"{error}; did you mean {' or '.join(near)}?"
+    if not isinstance(error, typer.BadParameter):
+        return str(error)
     if error.param is None or not isinstance(error.__cause__, ValidationError):
         return error.format_message()
     [found, *_] = error.__cause__.errors()

@@ -58,7 +58,7 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
         wanted = "a model or a scenario (see gcs scenarios)"
         raise ModelFileError(f"{file}: read no such file, wanted {wanted}{did_you_mean(file.stem, names())}") from None
     except OSError as error:
-        raise ModelFileError(f"{file}: {error.strerror}; wanted a JSON model") from None
+        raise ModelFileError(f"{file}: {error.strerror}, wanted a JSON model") from None
     except UnicodeDecodeError:
         raise ModelFileError(f"{file}: read bytes that are not UTF-8, wanted a JSON model") from None
     except BadModelError as error:

@@ -62,6 +62,14 @@ LinksOption = Annotated[
         help="replace the scenario's links with this profile (see gcs scenarios --links)",
     ),
 ]
+LinkDelayOption = Annotated[
+    float | None,
+    typer.Option(
+        "--link-delay",
+        metavar="SECONDS",
+        help="constant delay of every link, each way; --delay of gcs stress is up + down",
+    ),
+]
 KeyFile = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="sign with this key, and accept only frames signed with it (see gcs key)"),
@@ -99,25 +107,30 @@ def load_scenario(
     left_out: Sequence[int] | None = None,
     *,
     links: str | None = None,
+    link_delay_s: float | None = None,
     allow_code: bool | str = False,
 ) -> "Scenario":
     """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
-    The vehicles with the system ids `left_out` are left out; `links` names a profile that replaces its links. A
-    scenario that names code is refused unless `allow_code`, which may be what is wanted instead. Raises
-    scenarios.errors.ScenarioError if the file cannot be used, or not with this loop, without these vehicles, or with
-    these links.
+    The vehicles with the system ids `left_out` are left out; `links` names a profile that replaces its links, and
+    `link_delay_s` their delay, each way. A scenario that names code is refused unless `allow_code`, which may be what
+    is wanted instead. Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop, without
+    these vehicles, or with these links.
     """
     from scenarios.files import load, with_loop, with_profile
     from scenarios.left_out import without
     from scenarios.own_code import refusal
     from scenarios.shipped import located
 
+    if link_delay_s is not None:
+        within("--link-delay", link_delay_s, 0, 60, "seconds")
     scenario = load(located(str(file)))
     if allow_code is not True and (refused := refusal(scenario, file, allow_code or "")):
         raise InputError(refused)
     if links is not None:
         scenario = with_profile(scenario, links, Path("--links"), "")
+    if link_delay_s is not None:
+        scenario = scenario.with_link_delay(up_s=link_delay_s, down_s=link_delay_s)
     scenario = scenario if loop is None else with_loop(scenario, loop, file)
     return without(scenario, left_out, file) if left_out else scenario
 

@@ -100,6 +100,7 @@ def check(
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
     links_of: fronts.LinksOf = None,
+    link_delay: options.LinkDelayOption = None,
     allow_unstable: options.AllowUnstable = False,
     allow_code: options.AllowCode = False,
     assert_headroom: Annotated[
@@ -118,9 +119,9 @@ def check(
     from gcs.plan.planner import flight_plan
 
     options.refuse_headroom(assert_headroom)
-    scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
+    scenario = options.load_scenario(scenario_file, loop, links=links, link_delay_s=link_delay, allow_code=allow_code)
     options.refuse(scenario_file, preflight.bad_start(scenario))
-    options.refuse(scenario_file, preflight.endless_link(scenario), in_file=links is None)
+    options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
     scenario, measured = chosen_for(scenario, links_of)
     design, plan = flight_plan(scenario, measured)
     if (unstable := preflight.unstable_loop(plan)) is not None:

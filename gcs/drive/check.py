@@ -9,7 +9,7 @@ from pydantic import Field
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
-from gcs.plan.expected_delay import expected_loop_delays_s, late_loop_delay_s, waits_for_channels
+from gcs.plan.expected_delay import late_loop_delay_s, planned_loop_delays_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.loops import link_delays_left_s
@@ -113,7 +113,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             apart = np.array(ahead.position_ne_m) - vehicle.position_ne_m
             errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
     commands = plan.gain @ errors
-    limits, delays_s = scenario.limits, expected_loop_delays_s(scenario)
+    limits, delays_s = scenario.limits, planned_loop_delays_s(plan)
     left_s = link_delays_left_s(plan) if scenario.control.prediction != "measured" else {}
     vehicles: list[VehicleCheck] = []
     for row, vehicle in enumerate(ordered):

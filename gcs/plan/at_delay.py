@@ -16,14 +16,16 @@ from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, Flown
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.onboard import own_part
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
-from gcs.plan.expected_delay import expected_loop_delay_s
+from gcs.plan.expected_delay import planned_loop_delays_s
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
 
-def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
+def with_figures_at_delay(design: Design, plan: FlightPlan) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
-    figures = figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump()
+    scenario = plan.scenario
+    figures = figures_at(design, scenario, max(planned_loop_delays_s(plan).values())).model_dump()
     if figures["alpha"] is None:
         return design
     if not _is_predicted(design):

@@ -7,12 +7,15 @@ the slowest vehicle. Where datagrams may overtake each other and jitter is as la
 faster than this.
 """
 
-from itertools import product
+from collections.abc import Collection, Mapping
 from math import ceil
+from types import MappingProxyType
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.sampled.onboard import own_part
+from gcs.plan.flight_plan import FlightPlan
 from scenarios.keys.link import Link
 from scenarios.keys.part import HELD_SHARE
 from scenarios.schema import Scenario
@@ -28,31 +31,48 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
     return max(expected_loop_delays_s(scenario).values())
 
 
-def expected_loop_delays_s(scenario: Scenario) -> dict[int, float]:
+def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
+    """The expected loop delays (s) of a plan's vehicles: with the loop on board, of the states that commands need."""
+    return expected_loop_delays_s(plan.scenario, _heard(plan) if plan.scenario.control.loop == "onboard" else {})
+
+
+def _heard(plan: FlightPlan) -> dict[int, set[int]]:
+    """The vehicles whose states the streamed command of each vehicle needs: a spacing error has two ends."""
+    model, ids = plan.model, plan.formation.system_ids
+    streamed, heard = plan.gain - own_part(model, plan.gain), {own: set[int]() for own in ids}
+    for i, own in enumerate(ids):
+        used = streamed[model.input_slice(i)]
+        for j, other in enumerate(ids):
+            if used[:, model.output_slice(j)].any():
+                heard[own].add(other)
+            if j and used[:, model.spacing_slice(j)].any():
+                heard[own].add(ids[model.predecessors[j]])
+    return heard
+
+
+def expected_loop_delays_s(
+    scenario: Scenario, heard: Mapping[int, Collection[int]] = MappingProxyType({})
+) -> dict[int, float]:
     """The expected loop delay (s) of each vehicle by its system id, at the slowest delay points of its links.
 
     On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
     first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams. With the loop on board, a command may
-    need a state from the slowest link up of all. The time that datagrams wait for a channel is not included
+    happen to be. With jitter or losses it is the median over drawn datagrams. A vehicle of which `heard` names others
+    has the slowest of their links up in place of its own. The time that datagrams wait for a channel is not included
     (`waits_for_channels`).
     """
     links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
-    unlike = dict.fromkeys(links.values())
-    ups, downs = dict.fromkeys(up for up, _ in unlike), dict.fromkeys(down for _, down in unlike)
-    streamed = scenario.control.loop == "onboard"
+    pairs_of = {own: [(links[k][0], links[own][1]) for k in heard.get(own) or [own]] for own in links}
+    unlike = dict.fromkeys(pair for pairs in pairs_of.values() for pair in pairs)
     if any(link.jitter or link.loss_probability or link.loss_bursts for pair in unlike for link in pair):
         rng = np.random.default_rng(0)
-        ages = {up: _ages_s(scenario, up, rng) for up in ups}
-        late = {down: _arrival_delays_s(scenario, down, rng) for down in downs}
-        pairs = product(ups, downs) if streamed else unlike
-        around_s = {(up, down): _median_of_sum(ages[up], late[down], rng) for up, down in pairs}
+        ages = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for up, _ in unlike)}
+        late = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in unlike)}
+        around_s = {(up, down): _median_of_sum(ages[up], late[down], rng) for up, down in unlike}
     else:
         waiting_s = 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
-        around_s = {(up, down): up.delay_max_s + down.delay_max_s + waiting_s for up, down in product(ups, downs)}
-    if streamed:
-        return {own: max(around_s[up, down] for up in ups) for own, (_, down) in links.items()}
-    return {own: around_s[pair] for own, pair in links.items()}
+        around_s = {(up, down): up.delay_max_s + down.delay_max_s + waiting_s for up, down in unlike}
+    return {own: max(around_s[pair] for pair in pairs) for own, pairs in pairs_of.items()}
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:

@@ -11,7 +11,7 @@ from math import inf, isnan, nan
 
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
-from gcs.plan.expected_delay import expected_loop_delays_s
+from gcs.plan.expected_delay import planned_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
@@ -50,19 +50,36 @@ def loop_of(plan: FlightPlan, system_id: int) -> CoupledBlock:
 
 
 def growth_1_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
-    """The growth at expected loop delays: a state is at the station after half of the link delay and of the waiting."""
-    waiting_s = block.timing.faster_s / 2.0
-    return block.growth_at_1_s(loop_delay_s, {own: (at_s + waiting_s) / 2.0 for own, at_s in loop_delay_s.items()})
+    """The growth at expected loop delays."""
+    return block.growth_at_1_s(loop_delay_s, _ages_s(block, loop_delay_s))
+
+
+def _ages_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> dict[int, float]:
+    """The ages of states at the station: half of the link delay and of the waiting have passed."""
+    return {own: (at_s + block.timing.faster_s / 2.0) / 2.0 for own, at_s in loop_delay_s.items()}
+
+
+def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
+    """Whether a loop is predicted to be stable at expected loop delays.
+
+    The sign of the growth is right to 0.1 % of the delay on the ground, where counted roots are to 0.2 %; on board it
+    is to 0.4 % and they are to 0.02 %.
+    """
+    if plan.scenario.control.loop == "onboard":
+        return block.is_stable_at(loop_delay_s)
+    return growth_1_s(block, loop_delay_s) < 0.0
 
 
 def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
     """The growth (1/s) predicted of a vehicle's loop at its loop delay (s), with all other links as in the scenario."""
-    block, expected_s = loop_of(plan, system_id), expected_loop_delays_s(plan.scenario)
+    block, expected_s = loop_of(plan, system_id), planned_loop_delays_s(plan)
     return lambda delay_s: growth_1_s(block, expected_s | {system_id: delay_s})
 
 
 def window_of(plan: FlightPlan, system_id: int) -> Window:
-    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if no model predicts it.
+    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if they are not predicted.
+
+    They are not without a model, nor with a shared loop on board: whichever state comes last delays a command.
 
     The links of all other vehicles stay as they are in the scenario. In a shared loop that is unstable over them, the
     shorter delays of this vehicle are searched; (0, 0) if none makes it stable.
@@ -72,23 +89,30 @@ def window_of(plan: FlightPlan, system_id: int) -> Window:
         return 0.0, plan.delay_margin_s
     if len(block.system_ids) == 1:
         return block.loop.window_s()
-    growth, now_s = growth_of(plan, system_id), expected_loop_delays_s(plan.scenario)[system_id]
-    step_s, stable = _STEP * block.margin_s(), growth(now_s) < 0.0
+    if plan.scenario.control.loop == "onboard":
+        return 0.0, nan
+    expected_s = planned_loop_delays_s(plan)
+
+    def is_stable_at(delay_s: float) -> bool:
+        return _is_stable(plan, block, expected_s | {system_id: delay_s})
+
+    now_s = expected_s[system_id]
+    step_s, stable = _STEP * block.margin_s(), is_stable_at(now_s)
     shorter_s = 0.0
     if plan.assumed_s is not None or not stable:
-        shorter_s = _edge_s(growth, now_s, -step_s, end_s=0.0, stable=stable)
-    return (shorter_s, _edge_s(growth, now_s, step_s, end_s=inf, stable=True)) if stable else (0.0, shorter_s)
+        shorter_s = _edge_s(is_stable_at, now_s, -step_s, end_s=0.0, stable=stable)
+    return (shorter_s, _edge_s(is_stable_at, now_s, step_s, end_s=inf, stable=True)) if stable else (0.0, shorter_s)
 
 
-def _edge_s(growth: Callable[[float], float], at_s: float, step_s: float, *, end_s: float, stable: bool) -> float:
+def _edge_s(is_stable_at: Callable[[float], bool], at_s: float, step_s: float, *, end_s: float, stable: bool) -> float:
     """Where stability ends or, if the loop is not `stable` to begin with, begins; `end_s` if it does not."""
     for _ in range(_STEPS):
         inner_s, at_s = at_s, at_s + step_s
         at_s = max(0.0, at_s)
-        if (growth(at_s) < 0.0) != stable:
+        if is_stable_at(at_s) != stable:
             for _ in range(_HALVINGS):
                 middle_s = (inner_s + at_s) / 2.0
-                inner_s, at_s = (middle_s, at_s) if (growth(middle_s) < 0.0) == stable else (inner_s, middle_s)
+                inner_s, at_s = (middle_s, at_s) if is_stable_at(middle_s) == stable else (inner_s, middle_s)
             return (inner_s + at_s) / 2.0
         if at_s == 0.0:
             break
@@ -97,31 +121,31 @@ def _edge_s(growth: Callable[[float], float], at_s: float, step_s: float, *, end
 
 def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int]:
     """The vehicles whose loops are predicted to be unstable over the scenario's links, outside the loop of `but`."""
-    expected_s = expected_loop_delays_s(plan.scenario)
+    expected_s = planned_loop_delays_s(plan)
     loops = plan_loops(plan) if is_modelled(plan) else []
-    unstable = [each for each in loops if but not in each.system_ids and growth_1_s(each, expected_s) >= 0.0]
+    unstable = [each for each in loops if but not in each.system_ids and not _is_stable(plan, each, expected_s)]
     return [own for block in unstable for own in block.system_ids]
 
 
 def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
     """Whether vehicles share this loop over links that differ, so that its margin says little, and a model knows more.
 
-    None does with loops on board or prediction, or of many vehicles.
+    None does with prediction, or of many vehicles.
     """
-    if block.extrapolated is None or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
+    if not block.takes_unlike_delays or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
-    delays_s = expected_loop_delays_s(plan.scenario)
+    delays_s = planned_loop_delays_s(plan)
     return len({delays_s[own] for own in block.system_ids}) > 1
 
 
 def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
     """How much more delay each vehicle's link takes with all others as in the scenario: NaN where it is not known."""
-    expected_s, windows, left_s = expected_loop_delays_s(plan.scenario), dict[Hashable, Window](), dict[int, float]()
+    expected_s, windows, left_s = planned_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
         for system_id in block.system_ids:
             alone = len(block.system_ids) == 1
             key = block.kind if alone else system_id
-            known = alone or (block.extrapolated is not None and len(block.system_ids) <= _MOST_SHARING)
+            known = alone or (block.takes_unlike_delays and len(block.system_ids) <= _MOST_SHARING)
             if key not in windows:
                 windows[key] = window_of(plan, system_id) if known else (0.0, nan)
             left_s[system_id] = windows[key][1] - expected_s[system_id]
@@ -135,7 +159,7 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
     """
     if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
         return None
-    expected_s, margins_s = expected_loop_delays_s(plan.scenario), list[float]()
+    expected_s, margins_s = planned_loop_delays_s(plan), list[float]()
     for each in (replace(plan, gain=K) for K in plan.gains):
         margins_s.append(inf)
         for block in plan_loops(each):
@@ -146,11 +170,13 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
 
 def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
     """How many times its expected loop delays a loop takes that vehicles share; 0 if it is unstable at any."""
-    expected_s = expected_loop_delays_s(plan.scenario)
+    expected_s = planned_loop_delays_s(plan)
     own_s = {own: expected_s[own] for own in block.system_ids}
+    if block.margin_s() == inf:
+        return inf
 
-    def growth(factor: float) -> float:
-        return growth_1_s(block, {own: factor * at_s for own, at_s in own_s.items()})
+    def is_stable_at(factor: float) -> bool:
+        return _is_stable(plan, block, {own: factor * at_s for own, at_s in own_s.items()})
 
-    stable, step = growth(1.0) < 0.0, _STEP * block.margin_s() / max(own_s.values())
-    return _edge_s(growth, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)
+    stable, step = is_stable_at(1.0), _STEP * block.margin_s() / max(own_s.values())
+    return _edge_s(is_stable_at, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)

@@ -161,7 +161,7 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
         design, plan = onboard_plan(design, plan)
     if plan.scenario.control.prediction != "off":
         design = design.model_copy(update={"prediction": _prediction(plan)})
-    design = with_figures_at_delay(design, plan.scenario)
+    design = with_figures_at_delay(design, plan)
     return with_criteria(design, plan.scenario), plan
 
 
@@ -240,7 +240,7 @@ def described(design: Design, plan: FlightPlan) -> Design:
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
     schedule = _with_margins(design, plan.margins_s, continuous_s)
-    return with_figures_at_delay(known.with_schedule(schedule, response=response), plan.scenario)
+    return with_figures_at_delay(known.with_schedule(schedule, response=response), plan)
 
 
 def _with_margins(

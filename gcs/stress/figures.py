@@ -9,7 +9,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import unlike_blocks
-from gcs.plan.expected_delay import expected_loop_delays_s
+from gcs.plan.expected_delay import planned_loop_delays_s
 from gcs.plan.loops import growth_of, is_modelled, plan_loops
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
@@ -39,7 +39,7 @@ def growth_figure(
     delay_s = _column(probes, "loop_delay_s")
     measured, predicted, error = (_column(probes, name) for name in _RATES)
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
-    expected_s = expected_loop_delays_s(study.plan.scenario)
+    expected_s = planned_loop_delays_s(study.plan)
     here_s = max(expected_s.values()) if onset is None or onset.vehicle is None else expected_s[onset.vehicle]
     first_s, last_s = min(here_s, float(delay_s.min())), max(here_s, float(delay_s.max()))
     room_s = 0.03 * (last_s - first_s or 0.1)

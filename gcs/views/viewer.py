@@ -132,12 +132,12 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
         try:
             viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
         except ConnectionError:  # it has loaded nothing that has times
-            raise InputError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
+            raise InputError(f"{recording}: the viewer reads no flight in it, {_WANTED}") from None
         viewer.run_command("ui.toggle_top_panel")  # of no use on a picture
         png.write_bytes(_settled_picture(viewer))
         state = viewer.get_state()
     if not state.views:
-        raise InputError(f"{recording}: the viewer shows nothing of it; {_WANTED}")
+        raise InputError(f"{recording}: the viewer shows nothing of it, {_WANTED}")
     return [f"{shown.name}: {report}" for shown in state.views for report in shown.reports]
 
 
@@ -147,13 +147,14 @@ def find_recording(folder_or_rrd: Path) -> Path:
     if recording.is_file():
         with recording.open("rb") as opened:
             if opened.read(len(_MAGIC)) != _MAGIC:
-                raise InputError(f"{recording}: read a file of another kind; {_WANTED}")
+                raise InputError(f"{recording}: read a file of another kind, {_WANTED}")
         return recording
     if not folder_or_rrd.is_dir():
-        raise InputError(f"{folder_or_rrd}: no such run folder or recording")
+        raise InputError(f"{folder_or_rrd}: read no such file, wanted a run folder or an .rrd file")
     if (folder_or_rrd / UNFINISHED_FILE).exists():
-        raise InputError(f"{folder_or_rrd}: the recording is not finished; the run still flies, or it was killed")
-    raise InputError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
+        read = "a recording that is not finished, as the run still flies or was killed"
+        raise InputError(f"{folder_or_rrd}: read {read}, wanted a finished one")
+    raise InputError(f"{folder_or_rrd}: read no {RECORDING_FILE}, wanted a run folder or an .rrd file")
 
 
 def vulkan_missing() -> bool:

@@ -268,3 +268,9 @@ def test_bounds_of_requirements_are_those_of_designs() -> None:
     for past in ({"delay_margin_s": 1.001 * most_s}, {"alpha": 0.999 * least}):
         with pytest.raises(ValidationError):
             Control.model_validate(past)
+
+
+@pytest.mark.parametrize("delay_s", [-0.1, float("nan"), float("inf")])
+def test_a_link_delay_that_is_none_is_refused(delay_s: float) -> None:
+    with pytest.raises(ScenarioError, match=r"triangle5: down_s: read .*, wanted a delay in seconds, from 0"):
+        load(SCENARIOS / "triangle5.toml").with_link_delay(up_s=0.1, down_s=delay_s)

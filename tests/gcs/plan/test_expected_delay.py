@@ -3,9 +3,10 @@
 import pytest
 
 from gcs import fly_virtual
-from gcs.plan.expected_delay import expected_loop_delay_s, late_loop_delay_s
-from scenarios.files import load, with_profile
-from scenarios.keys.link import Jitter, Link, Links
+from gcs.plan.expected_delay import expected_loop_delay_s, late_loop_delay_s, planned_loop_delays_s
+from gcs.plan.planner import flight_plan
+from scenarios.files import load, with_loop, with_profile
+from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
 from scenarios.schema import Scenario
 from scenarios.shipped import FOLDER
 
@@ -40,3 +41,18 @@ def test_expected_and_late_loop_delay_are_those_of_flights(scenario: Scenario) -
 
 def test_jitter_that_is_never_negative_exceeds_its_mean() -> None:
     assert expected_loop_delay_s(over(Jitter(distribution="uniform", scale_s=0.05), 0.005)) > 0.04
+
+
+@pytest.mark.parametrize(
+    ("name", "expected_s"),
+    [("thesis_delay", [0.05, 0.1, 0.1]), ("chain3", [0.05, 0.05, 0.15])],
+    ids=["neighbours' states", "nothing is streamed"],
+)
+def test_on_board_the_slowest_state_that_a_command_needs_counts(name: str, expected_s: list[float]) -> None:
+    fast, slow = Link(delay_s=0.02), Link(delay_s=0.07)
+    links = Links(up=fast, down=fast, vehicles=(VehicleLinks(system_id=3, up=slow, down=slow),))
+    file = FOLDER / f"{name}.toml"
+    scenario = with_loop(load(file), "onboard", file).model_copy(update={"links": links, "duration_s": 10.0})
+    assert list(planned_loop_delays_s(flight_plan(scenario)[1]).values()) == pytest.approx(expected_s)
+    flown_s = [own.loop_delay_s.p50 for own in fly_virtual(scenario).summary.vehicles]
+    assert flown_s == pytest.approx(expected_s, abs=0.01)  # half of a period, as phases happen to be

@@ -9,7 +9,7 @@ from gcs import fly_virtual
 from gcs.cli.main import app
 from gcs.drive.check import check
 from gcs.errors import InputError
-from gcs.plan.loops import plan_loops
+from gcs.plan.loops import margins_over_links_s, plan_loops
 from gcs.plan.planner import flight_plan, over_own_links
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
@@ -18,6 +18,7 @@ from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Scenario
 from scenarios.shipped import located
 from tests.support.fleets.stress_pair import SCENARIO
+from tests.support.known import known
 
 EACH_OTHER = """
 name = "each_other"
@@ -127,6 +128,26 @@ def test_a_check_has_the_headroom_of_each_vehicle() -> None:
     leader_s = plan_loops(study_of(load(located("chain3"))).plan)[0].margin_s()
     assert [own.link_delay_left_s for own in found.vehicles] == pytest.approx([leader_s - 0.05, 0.25, 0.11])
     assert found.headroom == found.vehicles[2].headroom == pytest.approx(0.11 / 0.3)
+
+
+def test_loops_on_board_break_at_their_margin_over_links_that_differ() -> None:
+    scenario = with_links(load(located("thesis_delay")), all=0.05, v1=0.3)
+    study = study_of(scenario)
+    assert study.plan.delay_margin_s == pytest.approx(1.0022, abs=1e-4)
+    margins_s = margins_over_links_s(study.plan)
+    assert margins_s is not None
+    margin_s = margins_s[0]
+    assert margin_s == pytest.approx(1.0402, abs=5e-4)  # flown: 1.0402
+
+    def flown(share: float) -> float | None:
+        """The growth where all loop delays are this share of those at which it breaks."""
+        factor = share * margin_s / 0.61
+        each_way_s = [(factor * (2.0 * at_s + 0.01) - 0.01) / 2.0 for at_s in (0.05, 0.3)]
+        trial = study_of(with_links(scenario, all=each_way_s[0], v1=each_way_s[1])).trial("probe", {}, seed=6)
+        return fly_trial(trial).growth_1_s
+
+    assert known(flown(0.98)) < -0.003
+    assert known(flown(1.02)) > 0.01
 
 
 def test_a_shared_loop_may_break_far_below_its_margin() -> None:

@@ -127,5 +127,5 @@ def test_the_headless_viewer_opens_a_flight_without_view_errors(run: Path) -> No
 def test_a_recording_without_any_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
-    with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it, wanted a recording of a run"):
         screenshot(cut, tmp_path / "cut.png", time_s=0.0, width=800, height=500)

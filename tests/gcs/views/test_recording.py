@@ -181,17 +181,17 @@ def test_every_vehicle_has_a_colour_of_its_own(count: int) -> None:
 
 
 def test_a_missing_recording_is_named_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere: no such run folder or recording"):
+    with pytest.raises(InputError, match=r"nowhere: read no such file, wanted a run folder or an .rrd file"):
         find_recording(tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"no flight\.rrd here"):
+    with pytest.raises(InputError, match=r"read no flight\.rrd"):
         find_recording(tmp_path)
     (tmp_path / UNFINISHED_FILE).touch()
-    with pytest.raises(InputError, match=r"the recording is not finished"):
+    with pytest.raises(InputError, match=r"read a recording that is not finished"):
         find_recording(tmp_path)
     (tmp_path / RECORDING_FILE).write_bytes(b"RRF2")
     assert find_recording(tmp_path) == find_recording(tmp_path / RECORDING_FILE) == tmp_path / RECORDING_FILE
     (tmp_path / RECORDING_FILE).write_bytes(b"")
-    with pytest.raises(InputError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"flight\.rrd: read a file of another kind, wanted a recording of a run"):
         find_recording(tmp_path)
 
 
