@@ -19,8 +19,8 @@ from scenarios.keys.own import BUILT_IN
 _STEP, _STEPS = 0.1, 100
 """Steps, in margins of the whole loop, in which the edge of a shared loop is searched, and their number."""
 _HALVINGS = 8
-_MOST_SHARING = 6
-"""Most vehicles of a shared loop over whose links it is searched, which takes seconds."""
+_MOST_BY_GROWTH, _MOST_SHARING = 6, 20
+"""Most vehicles of a shared loop whose edge is that of its growth, which takes seconds, and whose edge is searched."""
 
 
 def is_modelled(plan: FlightPlan) -> bool:
@@ -62,11 +62,13 @@ def _ages_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> dict[int,
 def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
     """Whether a loop is predicted to be stable at expected loop delays.
 
-    The sign of the growth is right to 0.1 % of the delay on the ground, where counted roots are to 0.2 %; on board it
-    is to 0.4 % and they are to 0.02 %.
+    In flights with three vehicles on the ground the sign of the growth is right to 0.1 % of the delay, and the number
+    of roots to 0.2 %; with loops on board to 0.4 and 0.02 %.
     """
     if plan.scenario.control.loop == "onboard":
         return block.is_stable_at(loop_delay_s)
+    if len(block.system_ids) > _MOST_BY_GROWTH:
+        return block.is_stable_at(loop_delay_s, _ages_s(block, loop_delay_s))
     return growth_1_s(block, loop_delay_s) < 0.0
 
 

@@ -1,9 +1,11 @@
 """Coupled blocks of a formation: which vehicles they hold, and their margins and growth."""
 
 from math import atan, pi, sqrt
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, continuous_margin, formation_loop, response_states, sampled_margin
@@ -87,3 +89,32 @@ def test_positions_instead_of_errors_leave_the_growth_as_it_is(whole: bool) -> N
     delays_s = {1: 0.2, 2: 0.3, 3: 0.25}
     of_positions = shared.growth_continuous_at_1_s(delays_s, dict.fromkeys(ids, 0.1))
     assert of_positions == pytest.approx(shared.growth_continuous_at_1_s(delays_s), abs=1e-9)
+
+
+@pytest.mark.parametrize("aged", [False, True])
+def test_counted_roots_tell_where_growth_begins(aged: bool) -> None:
+    """Also with the root at zero of the formation's position, which states of several ages leave free."""
+    model, ids = FormationModel((-1, 0, 1)), (1, 2, 3)
+    K = model.overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
+    K[model.input_slice(0), model.spacing_slice(1)] = -0.4 * np.eye(2)
+    K[model.input_slice(1), model.spacing_slice(2)] = -0.4 * np.eye(2)
+    [block] = coupled_blocks(model, K, ids, timing=Timing(0.02, 0.02))
+    margin_s = block.margin_s()
+    assert [block.is_stable_at(dict.fromkeys(ids, part * margin_s)) for part in (0.9999, 1.0001)] == [True, False]
+    for slow in ids:
+        for part in (0.98, 1.02):
+            delays_s = dict.fromkeys(ids, 0.3 * margin_s) | {slow: part * _edge_s(block, slow, aged=aged)}
+            ages_s = {own: at_s / 2.0 for own, at_s in delays_s.items()} if aged else None
+            assert block.is_stable_at(delays_s, ages_s) == (block.growth_at_1_s(delays_s, ages_s) < 0.0)
+
+
+def _edge_s(block: CoupledBlock, slow: int, *, aged: bool) -> float:
+    """The loop delay of one vehicle at which the loop breaks, the others having 0.3 of its margin."""
+    margin_s = block.margin_s()
+
+    def growth_1_s(delay_s: float) -> float:
+        delays_s = dict.fromkeys(block.system_ids, 0.3 * margin_s) | {slow: delay_s}
+        return block.growth_at_1_s(delays_s, {own: at_s / 2.0 for own, at_s in delays_s.items()} if aged else None)
+
+    found: Any = brentq(growth_1_s, 0.3 * margin_s, 3.0 * margin_s, xtol=1e-4)
+    return float(found)
