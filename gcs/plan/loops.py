@@ -79,9 +79,7 @@ def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
 
 
 def window_of(plan: FlightPlan, system_id: int) -> Window:
-    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if they are not predicted.
-
-    They are not without a model, nor with a shared loop on board: whichever state comes last delays a command.
+    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if no model predicts it.
 
     The links of all other vehicles stay as they are in the scenario. In a shared loop that is unstable over them, the
     shorter delays of this vehicle are searched; (0, 0) if none makes it stable.
@@ -91,8 +89,6 @@ def window_of(plan: FlightPlan, system_id: int) -> Window:
         return 0.0, plan.delay_margin_s
     if len(block.system_ids) == 1:
         return block.loop.window_s()
-    if plan.scenario.control.loop == "onboard":
-        return 0.0, nan
     expected_s = planned_loop_delays_s(plan)
 
     def is_stable_at(delay_s: float) -> bool:
@@ -141,13 +137,16 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
 
 def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
-    """How much more delay each vehicle's link takes with all others as in the scenario: NaN where it is not known."""
+    """How much more delay each vehicle's link takes with all others as in the scenario: NaN where it is not known.
+
+    In a shared loop on board it is not: a link up delays the commands of others, too.
+    """
     expected_s, windows, left_s = planned_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
         for system_id in block.system_ids:
             alone = len(block.system_ids) == 1
             key = block.kind if alone else system_id
-            known = alone or (block.takes_unlike_delays and len(block.system_ids) <= _MOST_SHARING)
+            known = alone or (block.extrapolated is not None and len(block.system_ids) <= _MOST_SHARING)
             if key not in windows:
                 windows[key] = window_of(plan, system_id) if known else (0.0, nan)
             left_s[system_id] = windows[key][1] - expected_s[system_id]

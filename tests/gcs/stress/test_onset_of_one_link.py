@@ -104,6 +104,7 @@ def test_links_that_break_another_loop_leave_no_onset_to_find() -> None:
         (["--onset-of", "9"], "--onset-of: read 9, wanted one of the system ids 1 2 3"),
         (["--onset-of", "2", "--delay", "0.1"], "read --onset-of and --delay, wanted one of them"),
         (["--onset-of", "2", "--real-time"], "wanted a vehicle that shares its loop with no other"),
+        (["--onset-of", "2", "--loop", "onboard"], "read 2 with loops on board, wanted a vehicle that shares"),
     ],
 )
 def test_onsets_of_no_single_link_are_refused(options: list[str], wanted: str) -> None:
