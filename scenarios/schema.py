@@ -213,7 +213,8 @@ class Safety(Part):
     collision_distance_m: NotNegative = 5.0
     """Vehicles closer to each other than this have collided, which ends the flight."""
     settled_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """A follower has settled when its spacing error stays below this fraction of its spacing."""
+    """A follower has settled when its spacing error stays below this fraction of its spacing, at least for the last 5 %
+    of the flight."""
 
 
 class Monitor(Part):

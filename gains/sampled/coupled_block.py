@@ -22,7 +22,7 @@ from gains.formation.model import FormationModel
 from gains.sampled._extrapolated import ExtrapolatedLoop, extrapolated_loop
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop, streamed_loop
+from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
 from gains.sampled.prediction import checked_mask, mismatch_window, mismatch_window_continuous, predicted_growth_rate
 
 _SHIFT_1_S = 1e-6
@@ -126,14 +126,6 @@ class CoupledBlock:
     def has_late_terms(self) -> bool:
         """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
         return bool(self.loop.continuous_terms()[1].any())
-
-    @property
-    def takes_unlike_delays(self) -> bool:
-        """Whether `growth_at_1_s` holds where the vehicles' links differ: not with prediction.
-
-        With the loop on board it does without the ages: all states that a command uses are those of one instant.
-        """
-        return len(self.system_ids) == 1 or self.extrapolated is not None or isinstance(self.loop, OnboardLoop)
 
     def margin_s(self) -> float:
         """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""

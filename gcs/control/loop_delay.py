@@ -19,7 +19,9 @@ command computed from it acts:
 Error: up and down depend on the estimated offset of the vehicle's clock, and each may be wrong by `sample_bound_s` and
 `down_bound_s` of the tick record. If both use the same offset, its error cancels: it lengthens one by as much as it
 shortens the other. What remains is `loop_delay_bound_s`: the millisecond in which `time_boot_ms` counts, the error of
-the stamps in TIMESYNC replies, and what the estimate changed between the two.
+the stamps in TIMESYNC replies, and what the estimate changed between the two. Where a command on board counts from the
+state of another vehicle, two clocks are involved and nothing cancels: it is `down_bound_s` plus the largest
+`sample_bound_s` of all.
 """
 
 from math import ceil, inf, nan

@@ -121,7 +121,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         turning = (limits.turn_rate_max_rad_s or inf) * hypot(*vehicle.velocity_ne_m_s)
         most = min(limits.acceleration_max_m_s2 or inf, turning)
         own = vehicle.system_id
-        margin_s, used_s = _margin_and_used_s(plan, delays_s[own])
+        margin_s, used_s = _margin_and_used_s(plan, row, delays_s[own])
         vehicles.append(
             VehicleCheck(
                 system_id=vehicle.system_id,
@@ -167,10 +167,10 @@ def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
     return delay_s if plan.scenario.control.prediction == "measured" else plan.assumed_s or 0.0
 
 
-def _margin_and_used_s(plan: FlightPlan, delay_s: float) -> tuple[float, float]:
+def _margin_and_used_s(plan: FlightPlan, row: int, delay_s: float) -> tuple[float, float]:
     """The margin (s), and how much of it a loop delay uses; with prediction of the distance to the window's end."""
     assumed_s = _assumed_s(plan, delay_s)
-    tolerated = plan.tolerance(assumed_s)
+    tolerated = plan.tolerance_of(row, assumed_s)
     return tolerated.longer_s[0], tolerated.used_s(0, delay_s - assumed_s)
 
 

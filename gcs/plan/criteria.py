@@ -102,6 +102,7 @@ def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
         model, gain = formation.narrowed(np.array(design.K))
         responses = tuple(known) if known else None
     keys = scenario.control.criteria
-    delay_s = (keys and keys.at_delay_s) or expected_loop_delay_s(scenario)
+    expected_s = design.at_loop_delay.loop_delay_s if design.at_loop_delay else None
+    delay_s = (keys and keys.at_delay_s) or expected_s or expected_loop_delay_s(scenario)
     weight, discrete = (keys.weight, keys.discrete) if keys else (None, False)
     return LoopFigures(model, gain, flown_timing(design), delay_s, weight, responses, discrete=discrete)

@@ -7,7 +7,7 @@ the slowest vehicle. Where datagrams may overtake each other and jitter is as la
 faster than this.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from math import ceil
 from types import MappingProxyType
 
@@ -57,22 +57,34 @@ def expected_loop_delays_s(
 
     On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
     first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams. A vehicle of which `heard` names others
-    has the slowest of their links up in place of its own. The time that datagrams wait for a channel is not included
-    (`waits_for_channels`).
+    happen to be. With jitter or losses it is the median over drawn datagrams. Where `heard` names others for a vehicle,
+    it counts from the oldest of their states in place of its own. The time that datagrams wait for a channel is not
+    included (`waits_for_channels`).
     """
     links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
-    pairs_of = {own: [(links[k][0], links[own][1]) for k in heard.get(own) or [own]] for own in links}
-    unlike = dict.fromkeys(pair for pairs in pairs_of.values() for pair in pairs)
-    if any(link.jitter or link.loss_probability or link.loss_bursts for pair in unlike for link in pair):
+    states_of = {own: sorted(heard.get(own) or [own]) for own in links}
+    ways = {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
+    unlike = dict.fromkeys(ways.values())
+    if any(link.jitter or link.loss_probability or link.loss_bursts for ups, down in unlike for link in (*ups, down)):
         rng = np.random.default_rng(0)
-        ages = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for up, _ in unlike)}
+        ages = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for ups, _ in unlike for up in ups)}
         late = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in unlike)}
-        around_s = {(up, down): _median_of_sum(ages[up], late[down], rng) for up, down in unlike}
+        around_s = {
+            (ups, down): _median_of_sum(_oldest_s([ages[up] for up in ups], rng), late[down], rng)
+            for ups, down in unlike
+        }
     else:
         waiting_s = 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
-        around_s = {(up, down): up.delay_max_s + down.delay_max_s + waiting_s for up, down in unlike}
-    return {own: max(around_s[pair] for pair in pairs) for own, pairs in pairs_of.items()}
+        around_s = {
+            (ups, down): max(up.delay_max_s for up in ups) + down.delay_max_s + waiting_s for ups, down in unlike
+        }
+    return {own: around_s[way] for own, way in ways.items()}
+
+
+def _oldest_s(ages_s: Sequence[FloatArray], rng: np.random.Generator) -> FloatArray:
+    """The ages (s) of the oldest of several states, drawn independently of each other."""
+    first, *others = ages_s
+    return np.maximum.reduce([first, *(rng.permutation(own) for own in others)])
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:

@@ -60,6 +60,9 @@ class FlightPlan:
     """Flown in place of `gains` while a vehicle is lost; empty if those serve. A leader-follower tree stays stable when
     the nearest vehicle ahead stands in for a lost one. Gains on another pattern may need all of their terms, so
     inclusion gains of the same delay margin replace them; the step in the commands is accepted."""
+    own_margins_s: Mapping[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
+    """What the loop delay of single vehicles may be (s) with each of the gains, by row, where the formation's margins
+    are not theirs: infinite if none of their feedback is late."""
     law: Callable[..., Any] | None = None
     """The scenario's own control law (`gcs.plan.own_law.Law`), which is flown instead of `gains`."""
 
@@ -86,6 +89,11 @@ class FlightPlan:
         ends = [distances(window(own, prediction), prediction) for own in every]
         fixed = Tolerated(tuple(shorter for shorter, _ in ends), tuple(longer for _, longer in ends))
         return lambda _: fixed
+
+    def tolerance_of(self, row: int, assumed_s: float) -> Tolerated:
+        """The same for one vehicle."""
+        own_s = self.own_margins_s.get(row)
+        return self.tolerance(assumed_s) if own_s is None else Tolerated((inf,) * len(own_s), own_s)
 
     @property
     def responses_in_order(self) -> tuple[Response, ...] | None:

@@ -60,16 +60,12 @@ def _ages_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> dict[int,
 
 
 def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
-    """Whether a loop is predicted to be stable at expected loop delays.
+    """Whether a loop is predicted to be stable at expected loop delays, by the number of its roots.
 
-    In flights with three vehicles on the ground the sign of the growth is right to 0.1 % of the delay, and the number
-    of roots to 0.2 %; with loops on board to 0.4 and 0.02 %.
+    In flights with three vehicles this was right to 0.2 % of the delay on the ground, and to 0.02 % on board.
     """
-    if plan.scenario.control.loop == "onboard":
-        return block.is_stable_at(loop_delay_s)
-    if len(block.system_ids) > _MOST_BY_GROWTH:
-        return block.is_stable_at(loop_delay_s, _ages_s(block, loop_delay_s))
-    return growth_1_s(block, loop_delay_s) < 0.0
+    on_board = plan.scenario.control.loop == "onboard"
+    return block.is_stable_at(loop_delay_s, None if on_board else _ages_s(block, loop_delay_s))
 
 
 def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
@@ -78,21 +74,27 @@ def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
     return lambda delay_s: growth_1_s(block, expected_s | {system_id: delay_s})
 
 
-def window_of(plan: FlightPlan, system_id: int) -> Window:
+def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Window:
     """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if no model predicts it.
 
     The links of all other vehicles stay as they are in the scenario. In a shared loop that is unstable over them, the
-    shorter delays of this vehicle are searched; (0, 0) if none makes it stable.
+    shorter delays of this vehicle are searched; (0, 0) if none makes it stable. Its ends are where the growth changes
+    sign, which agrees with flights to 0.1 %; `quick` or for many vehicles, where the number of roots changes.
     """
     block = loop_of(plan, system_id)
     if not is_modelled(plan):
         return 0.0, plan.delay_margin_s
     if len(block.system_ids) == 1:
         return block.loop.window_s()
+    if block.margin_s() == inf:
+        return 0.0, inf
     expected_s = planned_loop_delays_s(plan)
 
     def is_stable_at(delay_s: float) -> bool:
-        return _is_stable(plan, block, expected_s | {system_id: delay_s})
+        delays_s = expected_s | {system_id: delay_s}
+        if quick or len(block.system_ids) > _MOST_BY_GROWTH:
+            return _is_stable(plan, block, delays_s)
+        return growth_1_s(block, delays_s) < 0.0
 
     now_s = expected_s[system_id]
     step_s, stable = _STEP * block.margin_s(), is_stable_at(now_s)
@@ -130,7 +132,7 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
     None does with prediction, or of many vehicles.
     """
-    if not block.takes_unlike_delays or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
+    if plan.scenario.control.prediction != "off" or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
     delays_s = planned_loop_delays_s(plan)
     return len({delays_s[own] for own in block.system_ids}) > 1
@@ -167,6 +169,38 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
             differ, slowest_s = links_differ(each, block), max(expected_s[own] for own in block.system_ids)
             margins_s[-1] = min(margins_s[-1], slowest_s * breaking_factor(each, block) if differ else block.margin_s())
     return tuple(margins_s)
+
+
+def own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, tuple[float, ...]]:
+    """What the loop delay of each vehicle alone may be (s) with each of the plan's gains, by row.
+
+    Only of vehicles that share a loop on the ground over links that differ, all others as in the scenario. `margins_s`
+    are those of `margins_over_links_s`: the slowest vehicle keeps them if they are less, and all do if their links are
+    past them.
+    """
+    expected_s, own_s = planned_loop_delays_s(plan), dict[int, list[float]]()
+    if plan.scenario.control.loop == "onboard":
+        return {}
+    for each, margin_s in zip((replace(plan, gain=K) for K in plan.gains), margins_s, strict=True):
+        for block in plan_loops(each):
+            if not links_differ(each, block):
+                continue
+            slowest = max(block.system_ids, key=expected_s.__getitem__)
+            for own in block.system_ids:
+                found = margin_s
+                if margin_s > expected_s[slowest]:
+                    alone_s = window_of(each, own, quick=True)[1]
+                    found = min(margin_s, alone_s) if own == slowest else alone_s
+                own_s.setdefault(plan.formation.row(own), []).append(found)
+    return {row: tuple(found) for row, found in own_s.items() if len(found) == len(plan.gains)}
+
+
+def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
+    """The margins, infinite, of the vehicles none of whose feedback is late, by row; empty if all are such."""
+    row, blocks = plan.formation.row, plan_loops(plan)
+    late = [block for block in blocks if block.has_late_terms]
+    at_once = [own for block in blocks if not block.has_late_terms for own in block.system_ids]
+    return {row(own): (inf,) * len(plan.gains) for own in at_once} if late else {}
 
 
 def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:

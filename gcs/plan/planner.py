@@ -41,7 +41,7 @@ from gcs.plan.flight_plan import (
 )
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.given import gain_blocks
-from gcs.plan.loops import margins_over_links_s
+from gcs.plan.loops import margins_over_links_s, own_margins_s, unlimited
 from gcs.plan.mismatch import assumption, continuous_window, proved_jump_s, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
@@ -134,11 +134,12 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
     """
     known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
     margins_s = margins_over_links_s(plan) if known else None
-    if margins_s is None:
+    if margins_s is None or margins_s == plan.margins_s:
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
     flown = design.with_schedule(_with_margins(design, margins_s, continuous_s))
-    return flown, plan.with_margins(margins_s, plan.responses)
+    own_s = {**plan.own_margins_s, **own_margins_s(plan, margins_s)}
+    return flown, replace(plan.with_margins(margins_s, plan.responses), own_margins_s=own_s)
 
 
 def with_trade_off(design: Design) -> Design:
@@ -159,6 +160,7 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the scenario's loop, from those of its ground loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
+        plan = replace(plan, own_margins_s=unlimited(plan))
     if plan.scenario.control.prediction != "off":
         design = design.model_copy(update={"prediction": _prediction(plan)})
     design = with_figures_at_delay(design, plan)

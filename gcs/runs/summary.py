@@ -41,6 +41,8 @@ from scenarios.schema import NS_PER_S, Scenario
 
 _SKEW_SPAN_S = 1.0
 """A clock's skew is not estimated over a shorter time than this."""
+_SETTLED_SHARE = 0.05
+"""Vehicles must stay settled for this share of the flight, its last."""
 _DECAYS = 7.0
 """The initial errors are gone after this many time constants of the slowest motion: e^-7 of them are left."""
 Errors = tuple[FloatArray, FloatArray]
@@ -227,6 +229,7 @@ def _error(rows: TickArray, column: str) -> Errors:
 def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Mapping[int, TickArray]) -> float | None:
     """When the last follower came within a fraction of its spacing for good; None if one has not.
 
+    It must stay there for the last `_SETTLED_SHARE` of the flight: errors that swing or grow come near zero, too.
     A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
     """
     whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
@@ -241,7 +244,8 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Ma
             return None
         if outside.size:
             latest = max(latest, float(time_s[outside[-1] + 1]))
-    return round(latest, 6)
+    last_s = max(float(time_s[-1]) for time_s, _ in errors.values())
+    return round(latest, 6) if latest <= (1.0 - _SETTLED_SHARE) * last_s else None
 
 
 def _vehicle(

@@ -12,7 +12,7 @@ As headroom shrinks, the monitor acts in this order:
 When the link recovers, these actions are undone in the reverse order.
 """
 
-from math import inf, isnan, nan
+from math import inf, isinf, isnan, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -87,6 +87,16 @@ def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> fl
 
 
 @kernel
+def _alike(delay_s: float, margin_s: float, other_s: float) -> float:
+    """The delay that uses as much of another margin; as it is if that has no limit."""
+    if margin_s == other_s or isinf(other_s):
+        return delay_s
+    if isinf(margin_s):
+        return 0.0
+    return delay_s * other_s / margin_s if margin_s > 0.0 else inf
+
+
+@kernel
 def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
     """Note the delays of a tick, and find the states after it.
 
@@ -94,6 +104,9 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
     """
     states, after, delays_s, width = watched.states, watched.after, watched.delays_s, watched.delays_s.shape[1]
     place, found, largest_s = watched.judged[0] % width, 0, nan if separable else -inf
+    margins_s, least_s = watched.margins_s, inf
+    for row in range(len(states)):
+        least_s = min(least_s, margins_s[row, 0])
     watched.judged[0] = watched.judged[0] + 1 if seen.flying else 0  # before the flight the loop is not closed
     known = min(watched.judged[0], width)
     for row in range(len(states)):
@@ -102,17 +115,19 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
             delays_s[row, place] = seen.loop_delay_s[row]
         if not separable:
             delay_s = _judged_delay_s(delays_s, row, known, watched.in_order)
+            delay_s = _alike(delay_s, margins_s[row, 0], least_s)
             largest_s = nan if isnan(delay_s) or isnan(largest_s) else max(largest_s, delay_s)
     for row in range(len(states)):
-        margins_s, state, new = watched.margins_s[row], states[row], after[row]
-        if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, largest_s, margins_s, policy):
+        own_s, state, new = margins_s[row], states[row], after[row]
+        alike_s = largest_s if separable else _alike(largest_s, least_s, own_s[0])
+        if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, alike_s, own_s, policy):
             continue
-        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else largest_s
+        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else alike_s
         own = Observation(
             seen.time_s, seen.flying, seen.silent[row], seen.guided[row], seen.failsafe[row], delay_s
         )  # fmt: skip
         new.mode, new.gain_set, new.former_set, new.changed_s, new.pressed_s, new.eased_s, new.released = next_state(
-            state_of(state), own, margins_s, policy
+            state_of(state), own, own_s, policy
         )
         if new.mode != state.mode or new.gain_set != state.gain_set or new.released != state.released:
             watched.changed[found] = row
@@ -172,8 +187,8 @@ def _blend(blends: Records, states: Records, time_s: float, blend_s: float) -> b
 class FormationMonitor:
     """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
 
-    `separable` says that every vehicle's loop has its own margin, as in a leader-follower tree. If not, the largest
-    loop delay counts for all vehicles, and all change gains together.
+    `separable` says that every vehicle's loop has its own margin, as in a leader-follower tree. If not, the loop delay
+    that uses most of its margin counts for all vehicles, and all change gains together.
     """
 
     def __init__(

@@ -328,7 +328,7 @@ class Station:
 
     def _tolerances(self, assumed_s: FloatArray) -> Tolerances:
         """How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
-        each = [*map(self.plan.tolerance, assumed_s.tolist())]
+        each = [self.plan.tolerance_of(row, at_s) for row, at_s in enumerate(assumed_s.tolist())]
         return np.array([own.shorter_s for own in each]), np.array([own.longer_s for own in each])
 
     def _take_back(self, controls: Records) -> None:

@@ -69,6 +69,10 @@ def fill(
     rows: Records, used: Array, links: Records, clocks: Records, counters: Records, judged: Judged,
     nearest_m: Array, sent_ns: Array, number: int, time_s: float, due_ns: int, key_ms: int,
 ) -> None:  # fmt: skip
+    most_s = 0.0
+    for k in range(len(rows)):
+        bound_s = judged.reported[k].bound_s
+        most_s = bound_s if bound_s > most_s else most_s  # NaN, of a state that is not known, is passed over
     for k in range(len(rows)):
         row, control, reported = rows[k], judged.controls[k], judged.reported[k]
         clock, counter, own_ns = clocks[k], counters[k], sent_ns[k]
@@ -92,7 +96,9 @@ def fill(
         down_ns = delivery_ns(links[k], clock, key_ms, own_ns)
         if down_ns != UNKNOWN:
             down_s, down_bound_s = down_ns * 1e-9, clock.down_bound_ns * 1e-9
-            loop_bound_s = clock.loop_bound_ns * 1e-9 if control.used_ns == control.sample_ns else nan
+            loop_bound_s = clock.loop_bound_ns * 1e-9
+            if control.used_ns != control.sample_ns:  # of another vehicle's clock, whose error adds to this one's
+                loop_bound_s = most_s + down_bound_s
         row.down_delay_s, row.down_bound_s, row.loop_delay_bound_s = down_s, down_bound_s, loop_bound_s
         row.clock_offset_s = row.clock_offset_bound_s = nan
         if clock.samples:
