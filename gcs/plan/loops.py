@@ -171,7 +171,16 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
     return tuple(margins_s)
 
 
-def own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, tuple[float, ...]]:
+def plan_over_links(plan: FlightPlan) -> FlightPlan:
+    """The plan with its margins over the scenario's links; itself where those for equal delays serve."""
+    margins_s = margins_over_links_s(plan)
+    if margins_s is None or margins_s == plan.margins_s:
+        return plan
+    own_s = {**plan.own_margins_s, **_own_margins_s(plan, margins_s)}
+    return replace(plan.with_margins(margins_s, plan.responses), own_margins_s=own_s)
+
+
+def _own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, tuple[float, ...]]:
     """What the loop delay of each vehicle alone may be (s) with each of the plan's gains, by row.
 
     Only of vehicles that share a loop on the ground over links that differ, all others as in the scenario. `margins_s`

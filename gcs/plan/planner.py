@@ -41,7 +41,7 @@ from gcs.plan.flight_plan import (
 )
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.given import gain_blocks
-from gcs.plan.loops import margins_over_links_s, own_margins_s, unlimited
+from gcs.plan.loops import plan_over_links, unlimited
 from gcs.plan.mismatch import assumption, continuous_window, proved_jump_s, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
@@ -133,13 +133,11 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
     Otherwise, and for vehicles whose response is not known yet, they stay as they are.
     """
     known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
-    margins_s = margins_over_links_s(plan) if known else None
-    if margins_s is None or margins_s == plan.margins_s:
+    flown = plan_over_links(plan) if known else plan
+    if flown is plan:
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
-    flown = design.with_schedule(_with_margins(design, margins_s, continuous_s))
-    own_s = {**plan.own_margins_s, **own_margins_s(plan, margins_s)}
-    return flown, replace(plan.with_margins(margins_s, plan.responses), own_margins_s=own_s)
+    return design.with_schedule(_with_margins(design, flown.margins_s, continuous_s)), flown
 
 
 def with_trade_off(design: Design) -> Design:

@@ -20,7 +20,7 @@ from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import first_uses, fly_plan, median_ages_s, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.loops import is_modelled, margins_over_links_s, plan_loops
+from gcs.plan.loops import is_modelled, plan_loops, plan_over_links
 from gcs.stress import free_response
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse
@@ -83,9 +83,7 @@ def _is_varied(probe: int, coordinates: Mapping[str, float]) -> bool:
 
 
 def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
-    plan = plan_of(trial)
-    if (margins_s := margins_over_links_s(plan)) is not None:  # as gcs fly has them
-        plan = plan.with_margins(margins_s, plan.responses)
+    plan = plan_over_links(plan_of(trial))  # with the margins of gcs fly
     flight = fly_plan(plan, real_time=trial.real_time, folder=folder)
     outcome = with_verdict(plan, flight, outcome)
     flown = chosen(flight.ticks, flight.ticks["time_s"] >= 0.0)

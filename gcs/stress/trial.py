@@ -17,6 +17,7 @@ from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight
 from gcs.plan.flight_plan import FlightPlan, Responses
 from gcs.plan.formation import plan_formation
+from gcs.plan.loops import unlimited
 from gcs.plan.own_law import law_of
 from gcs.runs.summary import control_of, judge
 from scenarios.schema import Scenario
@@ -126,9 +127,10 @@ def plan_of(trial: Trial) -> FlightPlan:
     scenario = trial.scenario.with_calm_monitor()
     law = law_of(scenario)
     separable = len(formation.model.coupled_vehicles(K)) == formation.model.vehicles
-    return FlightPlan(
+    plan = FlightPlan(
         scenario, formation, K, trial.delay_margin_s, separable=separable, responses=trial.responses, law=law
     )
+    return replace(plan, own_margins_s=unlimited(plan)) if scenario.control.loop == "onboard" else plan
 
 
 def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
