@@ -20,7 +20,7 @@ _STEP, _STEPS = 0.1, 100
 """Steps, in margins of the whole loop, in which the edge of a shared loop is searched, and their number."""
 _HALVINGS = 8
 _MOST_BY_GROWTH, _MOST_SHARING = 6, 20
-"""Most vehicles of a shared loop whose edge is that of its growth, which takes seconds, and whose edge is searched."""
+"""Most vehicles of a shared loop whose edge is found by its growth rate, which takes seconds, and by any way at all."""
 
 
 def is_modelled(plan: FlightPlan) -> bool:
@@ -130,7 +130,7 @@ def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int
 def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
     """Whether vehicles share this loop over links that differ, so that its margin says little, and a model knows more.
 
-    None does with prediction, or of many vehicles.
+    Never with prediction, nor with more vehicles than are searched.
     """
     if plan.scenario.control.prediction != "off" or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
@@ -172,8 +172,12 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
 
 
 def plan_over_links(plan: FlightPlan) -> FlightPlan:
-    """The plan with its margins over the scenario's links; itself where those for equal delays serve."""
-    margins_s = margins_over_links_s(plan)
+    """The plan with its margins over the scenario's links.
+
+    The plan itself where those for equal delays serve, or vehicles have responses that are not known yet.
+    """
+    known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
+    margins_s = margins_over_links_s(plan) if known else None
     if margins_s is None or margins_s == plan.margins_s:
         return plan
     own_s = {**plan.own_margins_s, **_own_margins_s(plan, margins_s)}

@@ -132,8 +132,7 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
 
     Otherwise, and for vehicles whose response is not known yet, they stay as they are.
     """
-    known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
-    flown = plan_over_links(plan) if known else plan
+    flown = plan_over_links(plan)
     if flown is plan:
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]

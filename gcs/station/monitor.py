@@ -87,8 +87,8 @@ def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> fl
 
 
 @kernel
-def _alike(delay_s: float, margin_s: float, other_s: float) -> float:
-    """The delay that uses as much of another margin; as it is if that has no limit."""
+def _scaled(delay_s: float, margin_s: float, other_s: float) -> float:
+    """The delay that uses the same share of another margin; unchanged if that is infinite."""
     if margin_s == other_s or isinf(other_s):
         return delay_s
     if isinf(margin_s):
@@ -105,7 +105,7 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
     states, after, delays_s, width = watched.states, watched.after, watched.delays_s, watched.delays_s.shape[1]
     place, found, largest_s = watched.judged[0] % width, 0, nan if separable else -inf
     margins_s, least_s = watched.margins_s, inf
-    for row in range(len(states)):
+    for row in range(0 if separable else len(states)):
         least_s = min(least_s, margins_s[row, 0])
     watched.judged[0] = watched.judged[0] + 1 if seen.flying else 0  # before the flight the loop is not closed
     known = min(watched.judged[0], width)
@@ -115,14 +115,14 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
             delays_s[row, place] = seen.loop_delay_s[row]
         if not separable:
             delay_s = _judged_delay_s(delays_s, row, known, watched.in_order)
-            delay_s = _alike(delay_s, margins_s[row, 0], least_s)
+            delay_s = _scaled(delay_s, margins_s[row, 0], least_s)
             largest_s = nan if isnan(delay_s) or isnan(largest_s) else max(largest_s, delay_s)
     for row in range(len(states)):
         own_s, state, new = margins_s[row], states[row], after[row]
-        alike_s = largest_s if separable else _alike(largest_s, least_s, own_s[0])
-        if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, alike_s, own_s, policy):
+        scaled_s = largest_s if separable else _scaled(largest_s, least_s, own_s[0])
+        if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, scaled_s, own_s, policy):
             continue
-        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else alike_s
+        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else scaled_s
         own = Observation(
             seen.time_s, seen.flying, seen.silent[row], seen.guided[row], seen.failsafe[row], delay_s
         )  # fmt: skip

@@ -276,7 +276,7 @@ class _Rebuilding:
         ids = [vehicle.remote.system_id for vehicle in self._vehicles]
         sent = [commands.get(system_id, (sent_ns, None)) for system_id in ids]
         controls["command_m_s2"] = [one or (nan, nan) for _, one in sent]
-        tolerated = [self._fleet.plan.tolerance_of(k, at_s) for k, at_s in enumerate(controls["assumed_s"].tolist())]
+        tolerated = [self._fleet.plan.tolerance(assumed_s) for assumed_s in controls["assumed_s"].tolist()]
         judged = Judged(
             np.array(ids), np.array([int(state.mode) for state in self._states]),
             np.array([state.gain_set for state in self._states]), controls, self._reported,
