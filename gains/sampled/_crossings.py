@@ -10,6 +10,7 @@ little within a period, so those at a few m lead to every crossing without a mar
 they are eigenvalues of a Hamiltonian matrix and none is missed; for several, they come from a refined sweep.
 """
 
+from functools import lru_cache
 from math import ceil, floor, inf, pi
 from typing import Any
 
@@ -38,8 +39,11 @@ _FAR_FROM_ONE = 0.5
 _ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 
 
+@lru_cache(maxsize=256)
 def block_delay_margin(plant: SampledPlant) -> float:
     """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
+
+    Of the same plant it is computed once: designs, margins over links and loops of single vehicles all ask for it.
 
     DisagreementError if the eigenvalues of the one-period map contradict the crossings found.
     """

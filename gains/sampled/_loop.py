@@ -1,7 +1,7 @@
 """The sampled and held loop in matrices: one block, its hold integrals and its one-period map."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, fields
 from math import inf
 from typing import Any, Protocol
 
@@ -19,7 +19,23 @@ _DOUBLINGS = 60
 _ROUNDING, _MOST = 1e-15, 1e30
 
 
-class SampledPlant(Protocol):
+class ByContent:
+    """A dataclass of arrays and other values that equals another with the same bits, so that results are kept by it."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    @property
+    def _content(self) -> tuple[Any, ...]:
+        every: Any = self
+        values = (getattr(self, field.name) for field in fields(every))
+        return tuple((own.shape, own.tobytes()) if isinstance(own, np.ndarray) else own for own in values)
+
+
+class SampledPlant(Hashable, Protocol):
     """The plant under held commands: one block, linear, and the same in every period."""
 
     @property
@@ -43,8 +59,8 @@ class SampledPlant(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class HeldPlant:
+@dataclass(frozen=True, eq=False)
+class HeldPlant(ByContent):
     """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period.
 
     A station that predicts computes the states that are not `measured` (n,) from the commands; None: all are measured.

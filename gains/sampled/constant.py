@@ -70,6 +70,11 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
     return min(block_delay_margin(plant) for plant in plants)
 
 
+def forget_margins() -> None:
+    """Compute the sampled margins of loops anew that were asked for before, as what measures times wants."""
+    block_delay_margin.cache_clear()
+
+
 def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A (n, n), B (n, p), K (p, n) as finite real matrices; BadModelError names what does not fit."""
     [plant] = square_matrices(A=A)

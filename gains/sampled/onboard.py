@@ -32,7 +32,7 @@ from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled._crossings import block_delay_margin
-from gains.sampled._loop import matrix_exponentials
+from gains.sampled._loop import ByContent, matrix_exponentials
 from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
 
 # instants this close to a step (in steps) coincide with it
@@ -131,7 +131,7 @@ class OnboardLoop:
 
 
 @dataclass(frozen=True, eq=False)
-class LocalPlant:
+class LocalPlant(ByContent):
     """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part B K is its input.
 
     A = `free` + `sensed` + `known` is what the sampled local loop approximates. Between steps the state x is followed

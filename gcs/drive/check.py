@@ -9,10 +9,11 @@ from pydantic import Field
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
-from gcs.plan.expected_delay import late_loop_delay_s, planned_loop_delays_s, waits_for_channels
+from gcs.plan.expected_delay import DrawnDelays, drawn_delays, planned_loop_delays_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.loops import link_delays_left_s
+from gcs.plan.mismatch import Tolerated
 from gcs.plan.own_law import code_by_key
 from gcs.published import Published
 from scenarios.schema import Scenario
@@ -80,10 +81,10 @@ class ScenarioCheck(Published):
     headroom: float | None
     """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
     any margin."""
-    loop_delay_s_p99: float | None
-    """The loop delay that 99 % of the set-points keep, over the slowest links; None with prediction or on board."""
+    loop_delay_s_p99: float
+    """The loop delay that 99 % of the set-points keep, over the slowest links."""
     headroom_p99: float | None
-    """The headroom at that delay."""
+    """The headroom that 99 % of the set-points keep, of the vehicle that has the least; None without any margin."""
     closest_m: float | None
     """Least distance between two vehicles in their places over the flight; None for a single vehicle."""
     closest_s: float | None
@@ -141,7 +142,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     tolerated = plan.tolerance(assumed_s)
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
-    late_s = late_loop_delay_s(scenario, _LATE) if scenario.control.loop == "ground" and not is_predicted else None
+    drawn = drawn_delays(plan)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
@@ -150,8 +151,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         assumed_delay_s=assumed_s if is_predicted else None,
         mismatch_window_s=window_s if is_predicted and margin_s < inf else None,
         headroom=min((left for own in vehicles if (left := own.headroom) is not None), default=None),
-        loop_delay_s_p99=late_s,
-        headroom_p99=None if late_s is None else _known(headroom(late_s, margin_s)),
+        loop_delay_s_p99=max(float(np.quantile(own.loop_s, _LATE)) for own in drawn.values()),
+        headroom_p99=_late_headroom(plan, drawn),
         closest_m=None if nearest is None else nearest.distance_m,
         closest_s=None if nearest is None else nearest.time_s,
         course=_course(scenario) if scenario.course.is_smooth else None,
@@ -172,6 +173,24 @@ def _margin_and_used_s(plan: FlightPlan, row: int, delay_s: float) -> tuple[floa
     assumed_s = _assumed_s(plan, delay_s)
     tolerated = plan.tolerance_of(row, assumed_s)
     return tolerated.longer_s[0], tolerated.used_s(0, delay_s - assumed_s)
+
+
+def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | None:
+    """The headroom that most set-points keep.
+
+    With prediction the age of a state is known, so only a set-point that acts at another instant than assumed is a
+    mismatch. A measured delay is assumed to be the mean.
+    """
+    prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
+    for row, system_id in enumerate(plan.formation.system_ids):
+        own = drawn[system_id]
+        assumed_s = _assumed_s(plan, float(own.loop_s.mean()))
+        tolerated = plan.tolerance_of(row, assumed_s)
+        if (kind := (id(own), tolerated)) not in late:
+            mismatch_s = own.loop_s if prediction == "off" else own.down_s + own.ages_s.mean() - assumed_s
+            used_s = [tolerated.used_s(0, each_s) for each_s in mismatch_s.tolist()]
+            late[kind] = headroom(float(np.quantile(used_s, _LATE)), tolerated.longer_s[0])
+    return _known(min(late.values()))
 
 
 def _known(value: float) -> float | None:

@@ -25,7 +25,8 @@ from scenarios.schema import Scenario
 def with_figures_at_delay(design: Design, plan: FlightPlan) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
     scenario = plan.scenario
-    figures = figures_at(design, scenario, max(planned_loop_delays_s(plan).values())).model_dump()
+    delays_s = planned_loop_delays_s(plan).values()
+    figures = figures_at(design, scenario, max(delays_s)).model_dump() | {"links_differ": min(delays_s) < max(delays_s)}
     if figures["alpha"] is None:
         return design
     if not _is_predicted(design):

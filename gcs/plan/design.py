@@ -158,6 +158,8 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     """None where α is kept at every loop delay; the same below."""
     string_peak_kept: float | None = None
     string_peak_kept_to_s: float | None = None
+    links_differ: bool = False
+    """Whether only the slowest link gives this loop delay, which the figures are of if all vehicles have it."""
 
 
 class VehicleSpread(Published):
@@ -276,6 +278,8 @@ class Design(Published):
     decay_rate_1_s: float | None = None
     delay_margin_s: Margin
     delay_margin_continuous_s: Margin = None
+    margin_over_links: bool = False
+    """Whether the sampled margin is that over the scenario's links, which differ; the continuous one never is."""
     period_s: float = 0.0
     vehicles: int = 0
     leader: BlockMargin | None = None

@@ -10,6 +10,7 @@ faster than this.
 from collections.abc import Collection, Mapping, Sequence
 from math import ceil
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,21 @@ _MOST = 20_000
 """Most datagrams drawn in one direction."""
 
 
+_Way = tuple[tuple[Link, ...], Link]
+"""The links up of the states that a vehicle's commands need, and its link down."""
+
+
+class DrawnDelays(NamedTuple):
+    """Delays at random ticks, each (k,): the ages of states (s) and the one-way delays of set-points (s)."""
+
+    ages_s: FloatArray
+    down_s: FloatArray
+
+    @property
+    def loop_s(self) -> FloatArray:
+        return self.ages_s + self.down_s
+
+
 def expected_loop_delay_s(scenario: Scenario) -> float:
     """The expected loop delay (s) of the vehicle with the slowest links."""
     return max(expected_loop_delays_s(scenario).values())
@@ -33,11 +49,13 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
 
 def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     """The expected loop delays (s) of a plan's vehicles: with the loop on board, of the states that commands need."""
-    return expected_loop_delays_s(plan.scenario, _heard(plan) if plan.scenario.control.loop == "onboard" else {})
+    return expected_loop_delays_s(plan.scenario, _heard(plan))
 
 
 def _heard(plan: FlightPlan) -> dict[int, set[int]]:
-    """The vehicles whose states the streamed command of each vehicle needs: a spacing error has two ends."""
+    """With the loop on board the vehicles whose states each streamed command needs: a spacing error has two ends."""
+    if plan.scenario.control.loop == "ground":
+        return {}
     model, ids = plan.model, plan.formation.system_ids
     streamed, heard = plan.gain - own_part(model, plan.gain), {own: set[int]() for own in ids}
     for i, own in enumerate(ids):
@@ -61,18 +79,10 @@ def expected_loop_delays_s(
     it counts from the oldest of their states in place of its own. The time that datagrams wait for a channel is not
     included (`waits_for_channels`).
     """
-    links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
-    states_of = {own: sorted(heard.get(own) or [own]) for own in links}
-    ways = {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
+    ways = _ways(scenario, heard)
     unlike = dict.fromkeys(ways.values())
     if any(link.jitter or link.loss_probability or link.loss_bursts for ups, down in unlike for link in (*ups, down)):
-        rng = np.random.default_rng(0)
-        ages = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for ups, _ in unlike for up in ups)}
-        late = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in unlike)}
-        around_s = {
-            (ups, down): _median_of_sum(_oldest_s([ages[up] for up in ups], rng), late[down], rng)
-            for ups, down in unlike
-        }
+        around_s = {way: float(np.median(drawn.loop_s)) for way, drawn in _drawn(scenario, unlike).items()}
     else:
         waiting_s = 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
         around_s = {
@@ -81,24 +91,41 @@ def expected_loop_delays_s(
     return {own: around_s[way] for own, way in ways.items()}
 
 
-def _oldest_s(ages_s: Sequence[FloatArray], rng: np.random.Generator) -> FloatArray:
-    """The ages (s) of the oldest of several states, drawn independently of each other."""
-    first, *others = ages_s
-    return np.maximum.reduce([first, *(rng.permutation(own) for own in others)])
+def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
+    """Delays drawn over the links of each of a plan's vehicles, of which `planned_loop_delays_s` are the medians."""
+    ways = _ways(plan.scenario, _heard(plan))
+    drawn = _drawn(plan.scenario, dict.fromkeys(ways.values()))
+    return {own: drawn[way] for own, way in ways.items()}
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
     """Loop delays (s) drawn over one vehicle's links, at random ticks (k,), as `expected_loop_delay_s` draws them."""
+    way = (up,), down
+    return _drawn(scenario, [way])[way].loop_s
+
+
+def _ways(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int, _Way]:
+    """The links up whose states count for each vehicle, and its link down."""
+    links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
+    states_of = {own: sorted(heard.get(own) or [own]) for own in links}
+    return {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
+
+
+def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays]:
     rng = np.random.default_rng(0)
-    ages = _ages_s(scenario, up, rng)
-    return ages + rng.choice(_arrival_delays_s(scenario, down, rng), len(ages))
+    ages_s = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for ups, _ in ways for up in ups)}
+    late_s = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in ways)}
+    drawn: dict[_Way, DrawnDelays] = {}
+    for ups, down in ways:
+        oldest_s = _oldest_s([ages_s[up] for up in ups], rng)
+        drawn[ups, down] = DrawnDelays(oldest_s, rng.choice(late_s[down], len(oldest_s)))
+    return drawn
 
 
-def late_loop_delay_s(scenario: Scenario, share: float) -> float:
-    """The loop delay (s) that a share of the set-points keeps, over the slowest links of a loop on the ground."""
-    links = {scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
-    drawn = (drawn_loop_delays_s(scenario, up, down) for up, down in links)
-    return max(float(np.quantile(delays_s, share)) for delays_s in drawn)
+def _oldest_s(ages_s: Sequence[FloatArray], rng: np.random.Generator) -> FloatArray:
+    """The ages (s) of the oldest of several states, drawn independently of each other."""
+    first, *others = ages_s
+    return np.maximum.reduce([first, *(rng.permutation(own) for own in others)])
 
 
 def waits_for_channels(scenario: Scenario) -> bool:
@@ -106,10 +133,6 @@ def waits_for_channels(scenario: Scenario) -> bool:
     return any(
         link.channel is not None for vehicle in scenario.vehicles for link in scenario.link_of(vehicle.system_id)
     )
-
-
-def _median_of_sum(age_s: FloatArray, down_s: FloatArray, rng: np.random.Generator) -> float:
-    return float(np.median(age_s + rng.choice(down_s, len(age_s))))
 
 
 def _stream(

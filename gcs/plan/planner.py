@@ -136,7 +136,8 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
     if flown is plan:
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
-    return design.with_schedule(_with_margins(design, flown.margins_s, continuous_s)), flown
+    over_links = design.with_schedule(_with_margins(design, flown.margins_s, continuous_s))
+    return over_links.model_copy(update={"margin_over_links": True}), flown
 
 
 def with_trade_off(design: Design) -> Design:

@@ -25,7 +25,7 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.criteria import with_bounds
 from gcs.plan.design import Design, GainsAtDelay, LinkPart
 from gcs.plan.disturbed import with_spread
-from gcs.plan.planner import flight_plan, with_trade_off
+from gcs.plan.planner import flight_plan, over_own_links, with_trade_off
 from gcs.runs.files import write_design
 from gcs.runs.record import SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
@@ -35,6 +35,7 @@ from gcs.studies.virtual import fly_virtual
 from scenarios import files
 from scenarios.keys.criteria import Criteria
 from scenarios.keys.disturbance import Navigation
+from scenarios.keys.link import Link, Links, VehicleLinks
 from scenarios.schema import FixedGains, Response
 from tests.support.fleets.own_code import coded
 
@@ -125,7 +126,10 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     varying = load["chain3"].control.model_copy(update={"criteria": Criteria(delays_s=(0.0, 0.1))})
     load["varying"] = load["chain3"].model_copy(update={"control": varying})
     load["own law"] = coded(law="soft")
-    planned = (flight_plan(scenario) for scenario in load.values())
+    slow = Link(delay_s=0.12)
+    unlike = Links(up=Link(delay_s=0.02), down=slow, vehicles=(VehicleLinks(system_id=3, up=slow),))
+    load["two way"] = load["two way"].model_copy(update={"links": unlike})
+    planned = (over_own_links(*flight_plan(scenario)) for scenario in load.values())
     designs = (with_bounds(with_spread(with_trade_off(design), plan), plan.scenario) for design, plan in planned)
     link = LinkPart(
         source="runs/log", vehicles=(1,), loop_delay_s_least=0.1, loop_delay_s_p50=0.2, loop_delay_s_worst=0.3,

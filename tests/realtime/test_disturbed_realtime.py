@@ -1,8 +1,6 @@
 """A disturbed formation over UDP on the real clock: its errors spread as computed."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +9,7 @@ from scenarios.files import dump, load
 from scenarios.keys.disturbance import Disturbance, Gusts, Navigation
 from scenarios.schema import Clocks
 from tests.support.paths import SCENARIOS
+from tests.support.processes import gcs
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -26,8 +25,8 @@ def test_over_udp_errors_spread_as_predicted(tmp_path: Path) -> None:
     }
     file = tmp_path / "noisy.toml"
     file.write_text(dump(chain.model_copy(update=noisy)), encoding="utf-8")
-    command = [sys.executable, "-m", "gcs.cli.main", "fly", str(file), "--listen", "127.0.0.1:0", "--json"]
-    flown = subprocess.run([*command, "--out", str(tmp_path / "run")], capture_output=True, text=True, check=True)
+    flown = gcs("fly", file, "--listen", "127.0.0.1:0", "--json", "--out", tmp_path / "run")
+    assert flown.returncode == 0, flown.stderr
     spread = json.loads(flown.stdout)["spread"]
     ratios = [own["reported_rms_m"] / own["predicted_rms_m"] for own in spread["vehicles"]]
     # 20 s of mostly white noise: 5 % for a standard error of either, as in tests/flights/loops/test_disturbed_flight.py

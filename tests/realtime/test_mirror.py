@@ -3,7 +3,6 @@
 import json
 import socket
 import subprocess
-import sys
 import threading  # noqa: TID251 - stands for another process
 from collections import Counter
 from collections.abc import Callable, Generator
@@ -28,12 +27,11 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from tests.support.fleets.flown_fleet import until
 from tests.support.paths import ROOT
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import GCS, PATIENCE_S, gcs
 from tests.support.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
-GCS = [sys.executable, "-m", "gcs.cli.main"]
 PROBE = 31000
 """A command that nobody else sends."""
 
@@ -250,8 +248,7 @@ def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], wanted: str) -> None:
-    command = [*GCS, "fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=ROOT)
+    done = gcs("fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", *arguments)
     assert (done.returncode, done.stdout) == (2, "")
     assert wanted in done.stderr
     assert done.stderr.count("\n") == 1

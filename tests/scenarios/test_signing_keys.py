@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scenarios.signing.keys import Key, KeyFileError, make_key, read_key
 from scenarios.signing.stamps import Stamps, open_stamps
 from tests.support.paths import SCENARIOS
+from tests.support.processes import gcs
 
 SECRET = bytes(range(200, 232))
 
@@ -25,11 +26,6 @@ def a_file(folder: Path, data: bytes, mode: int = 0o600) -> Path:
     file.write_bytes(data)
     file.chmod(mode)
     return file
-
-
-def gcs(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "gcs.cli.main", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
 def test_three_forms_of_a_key_read_as_elsewhere(tmp_path: Path) -> None:

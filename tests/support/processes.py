@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from docs.generate.forked import run_gcs
 from gcs.control.tick import TICK
 from scenarios.files import dump, load
-from tests.support.paths import SCENARIOS
+from tests.support.paths import ROOT, SCENARIOS
 
 GCS = [sys.executable, "-m", "gcs"]
 PATIENCE_S = 180.0
@@ -25,6 +26,11 @@ def short(tmp_path: Path, name: str, duration_s: float) -> Path:
     file = tmp_path / f"{name}.toml"
     file.write_text(dump(scenario), encoding="utf-8")
     return file
+
+
+def gcs(*arguments: str | Path, folder: Path = ROOT, **environment: str) -> "subprocess.CompletedProcess[str]":
+    """What a command printed and its exit code, with these changes of the environment."""
+    return run_gcs([*map(str, arguments)], folder, environment, PATIENCE_S)
 
 
 def fly(*arguments: str | Path, **kwargs: Any) -> "subprocess.Popen[str]":

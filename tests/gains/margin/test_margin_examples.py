@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from math import log, pi
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.support.paths import ROOT
+from tests.support.processes import gcs
 
 KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
     "x' = -x(t - tau): pi/2": ({"A0": [[0.0]], "A1": [[-1.0]]}, [[0.0, pi / 2]]),
@@ -40,8 +40,7 @@ KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
 def run(tmp_path: Path, text: str, *options: str) -> "subprocess.CompletedProcess[str]":
     file = tmp_path / "model.json"
     file.write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "gcs.cli.main", "margin", str(file), *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return gcs("margin", file, *options)
 
 
 @pytest.mark.parametrize(("model", "intervals"), KNOWN.values(), ids=KNOWN)

@@ -7,8 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from gains.delay.constant import delay_margin
+from gains.sampled._crossings import block_delay_margin
 from gains.sampled._period import analyse_period
-from gains.sampled.constant import sampled_delay_margin, spectral_radius
+from gains.sampled.constant import forget_margins, sampled_delay_margin, spectral_radius
 
 Matrix = NDArray[np.float64]
 Loop = tuple[Matrix, Matrix, Matrix]
@@ -35,6 +36,17 @@ def first_unstable_delay_s(loop: Loop, *, period_s: float, up_to_s: float) -> fl
         middle_s = (lower_s + upper_s) / 2.0
         lower_s, upper_s = (lower_s, middle_s) if unstable(middle_s) else (middle_s, upper_s)
     return lower_s
+
+
+def test_a_margin_is_kept_for_the_same_loop_only() -> None:
+    A, B, K = FOLLOWER
+    forget_margins()
+    margin_s = sampled_delay_margin(A, B, K, period_s=0.1)
+    nearly_s = sampled_delay_margin(A, B, np.nextafter(K, 2.0), period_s=0.1)
+    assert sampled_delay_margin(A.copy(), B.copy(), K.copy(), period_s=0.1) == margin_s
+    assert (block_delay_margin.cache_info().hits, block_delay_margin.cache_info().misses) == (1, 2)
+    assert nearly_s != margin_s
+    assert sampled_delay_margin(A, B, K, period_s=0.2) < margin_s - 0.04
 
 
 def random_loop(seed: int) -> tuple[Loop, float]:

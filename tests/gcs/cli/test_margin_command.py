@@ -1,7 +1,6 @@
 """`gcs margin` from the outside: its JSON, its table, its exit codes, its time."""
 
 import json
-import os
 import subprocess
 import sys
 from math import acos, atan, log, pi, sqrt
@@ -17,6 +16,7 @@ from gains.margin.loop_margin import loop_margin
 from gains.margin.model_file import parse_model
 from gcs.cli.margin import ModelFileError, margin_fields, margin_of_file, margin_of_scenario, print_margin
 from tests.support.paths import SCENARIOS
+from tests.support.processes import gcs
 
 CLASSIC = {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]}
 CLASSIC_MARGIN_S = acos(-0.9) / sqrt(1.0 - 0.81)
@@ -27,13 +27,7 @@ def result_of(model: object) -> dict[str, Any]:
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gcs.cli.main", "margin", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "COLUMNS": "100", "OPENBLAS_NUM_THREADS": "1"},
-    )
+    return gcs("margin", *arguments, COLUMNS="100")
 
 
 def test_command_prints_json_and_nothing_else(tmp_path: Path) -> None:

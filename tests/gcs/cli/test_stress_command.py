@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.paths import SCENARIOS
+from tests.support.processes import gcs
 
 
 def stress_command(*arguments: str | Path) -> list[str]:
@@ -15,7 +16,7 @@ def stress_command(*arguments: str | Path) -> list[str]:
 
 
 def stress(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(stress_command(*arguments), capture_output=True, text=True, timeout=110, check=False)
+    return gcs("stress", *arguments)
 
 
 def test_onset_of_instability_is_measured_at_the_sampled_margin(tmp_path: Path) -> None:

@@ -1,12 +1,15 @@
 """The expected loop delay of jittery links against flights."""
 
+import numpy as np
 import pytest
 
 from gcs import fly_virtual
-from gcs.plan.expected_delay import expected_loop_delay_s, late_loop_delay_s, planned_loop_delays_s
+from gcs.drive.check import check
+from gcs.plan.expected_delay import expected_loop_delay_s, planned_loop_delays_s
 from gcs.plan.planner import flight_plan
 from scenarios.files import load, with_loop, with_profile
 from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
+from scenarios.keys.part import Prediction
 from scenarios.schema import Scenario
 from scenarios.shipped import FOLDER
 
@@ -36,7 +39,24 @@ def test_expected_and_late_loop_delay_are_those_of_flights(scenario: Scenario) -
     slowest_s, latest_s = (max(getattr(own.loop_delay_s, at) for own in flown.vehicles) for at in ("p50", "p99"))
     # 450 down delays and three phases: 2 % of standard error
     assert expected_loop_delay_s(scenario) == pytest.approx(slowest_s, rel=0.05)
-    assert late_loop_delay_s(scenario, 0.99) == pytest.approx(latest_s, rel=0.1)
+    assert check(flight_plan(scenario)[1]).loop_delay_s_p99 == pytest.approx(latest_s, rel=0.1)
+
+
+@pytest.mark.parametrize("prediction", ["off", "measured", 0.2])
+@pytest.mark.parametrize("name", ["chain3", "thesis_delay"], ids=["on the ground", "on board"])
+def test_late_headroom_is_that_of_flights(name: str, prediction: Prediction) -> None:
+    scenario = load(FOLDER / f"{name}.toml").with_calm_monitor()
+    control = scenario.control.model_copy(update={"prediction": prediction})
+    link = Link(delay_s=0.05, jitter=Jitter(distribution="uniform", scale_s=0.05))
+    changed = {"control": control, "links": Links(up=link, down=link), "duration_s": 40.0}
+    scenario = scenario.model_copy(update=changed)
+    flown = fly_virtual(scenario).ticks
+    flown = flown[flown["time_s"] > 5.0]
+    late = [np.quantile(flown["headroom"][flown["system_id"] == own], 0.01) for own in (1, 2, 3)]
+    expected = check(flight_plan(scenario)[1])
+    assert expected.headroom_p99 == pytest.approx(min(late), abs=0.05)
+    assert expected.headroom is not None
+    assert expected.headroom_p99 < expected.headroom - 0.02  # the expected headroom alone tells nothing of jitter
 
 
 def test_jitter_that_is_never_negative_exceeds_its_mean() -> None:

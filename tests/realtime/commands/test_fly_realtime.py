@@ -26,7 +26,7 @@ from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Control
 from sim_vehicles.links.truth import ACTED, SAMPLED, read_truth
 from tests.support.paths import SCENARIOS
-from tests.support.processes import GCS, PATIENCE_S, children_named, fly, flying, free_port, short, until
+from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, gcs, short, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -301,9 +301,7 @@ def test_gains_are_chosen_for_links_measured_just_before_the_flight(tmp_path: Pa
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], wanted: str) -> None:
-    done = subprocess.run(
-        [*GCS, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=SCENARIOS.parent
-    )
+    done = gcs(*arguments)
     assert done.returncode == 2
     assert wanted in done.stderr
     assert done.stderr.count("\n") == 1

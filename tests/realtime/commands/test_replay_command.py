@@ -11,7 +11,7 @@ import pytest
 
 from scenarios.files import dump, load
 from tests.support.paths import ROOT
-from tests.support.processes import GCS, PATIENCE_S
+from tests.support.processes import PATIENCE_S, gcs
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -28,11 +28,6 @@ while time.monotonic() < end:
 link.logfile.close()
 """
 """A ground station that listens and logs with pymavlink's own logger."""
-
-
-def gcs(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    command = [*GCS, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=ROOT)
 
 
 def quantiles_ms(figures: dict[str, Any], *names: str) -> list[float]:
