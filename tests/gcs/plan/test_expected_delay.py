@@ -48,15 +48,14 @@ def test_late_headroom_is_that_of_flights(name: str, prediction: Prediction) -> 
     scenario = load(FOLDER / f"{name}.toml").with_calm_monitor()
     control = scenario.control.model_copy(update={"prediction": prediction})
     link = Link(delay_s=0.05, jitter=Jitter(distribution="uniform", scale_s=0.05))
-    changed = {"control": control, "links": Links(up=link, down=link), "duration_s": 40.0}
+    changed = {"control": control, "links": Links(up=link, down=link), "duration_s": 20.0}
     scenario = scenario.model_copy(update=changed)
     flown = fly_virtual(scenario).ticks
     flown = flown[flown["time_s"] > 5.0]
     late = [np.quantile(flown["headroom"][flown["system_id"] == own], 0.01) for own in (1, 2, 3)]
     expected = check(flight_plan(scenario)[1])
     assert expected.headroom_p99 == pytest.approx(min(late), abs=0.05)
-    assert expected.headroom is not None
-    assert expected.headroom_p99 < expected.headroom - 0.02  # the expected headroom alone tells nothing of jitter
+    assert (expected.headroom_p99 or 0.0) < (expected.headroom or 0.0) - 0.02  # the median tells nothing of jitter
 
 
 def test_jitter_that_is_never_negative_exceeds_its_mean() -> None:
