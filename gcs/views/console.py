@@ -17,6 +17,8 @@ from rich.text import Text
 from gcs.errors import beyond
 
 UNKNOWN = "–"
+_MOST_NAMED = 12
+"""Most vehicles that a line names."""
 
 Item = TypeVar("Item")
 FittedColumn = tuple[str, int, int, Callable[[Item], str | Text]]
@@ -141,3 +143,10 @@ def progress(*, shown: bool) -> Generator[Callable[[str], Ended]]:
             return ended
 
         yield begin
+
+
+def vehicles_text(system_ids: Sequence[int]) -> str:
+    """Vehicles by their system ids; of many, the first are named."""
+    named = " ".join(str(system_id) for system_id in system_ids[:_MOST_NAMED])
+    more = f" and {len(system_ids) - _MOST_NAMED} more" if len(system_ids) > _MOST_NAMED else ""
+    return f"vehicle{'s' * (len(system_ids) > 1)} {named}{more}"

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gcs.control.tick import Mode
 from gcs.plan.design import (
     CodeRecord,
     CriteriaPart,
@@ -21,7 +22,7 @@ from gcs.plan.design import (
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
 from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
-from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_console, table_of
+from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_console, table_of, vehicles_text
 from scenarios.schema import GainBlock
 
 _HASH = 12
@@ -230,6 +231,8 @@ def flight_lines(summary: Summary) -> dict[str, str]:
     lines = {"verdict": f"{_reason(summary)}{flown}", "delay": delay_text(summary)}
     if summary.at_loop_delay.alpha is not None:
         lines["alpha"] = figures_text(summary.at_loop_delay)
+    if modes := _modes_text(summary):
+        lines["modes"] = modes
     if summary.code:
         lines["code"] = _code_text(summary.code)
     if (law := summary.law) is not None:
@@ -254,7 +257,7 @@ def print_flight(summary: Summary, console: Console) -> None:
     console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {lines['verdict']}"))
     for text in summary.not_logged:
         console.print(f"log      not written: {text}")
-    for name in ("delay", "alpha"):
+    for name in ("delay", "alpha", "modes"):
         if name in lines:
             console.print(f"{name:<9}{lines[name]}")
     console.print(response_text(summary.response), end="")
@@ -267,6 +270,24 @@ def print_flight(summary: Summary, console: Console) -> None:
     if summary.mirror:
         console.print(f"mirror   {in_words(summary.mirror)}")
     console.print(table_of(summary.vehicles, _VEHICLE_COLUMNS, dense=True))
+
+
+def _modes_text(summary: Summary) -> str:
+    """How long vehicles were where the station had to act, or could not."""
+    left_s = {vehicle.system_id: summary.duration_s or 0.0 for vehicle in summary.vehicles}
+    in_mode_s = {mode: dict.fromkeys(left_s, 0.0) for mode in (Mode.FAILSAFE, Mode.LOST, Mode.CRITICAL)}
+    for change in reversed(summary.mode_changes):
+        if change.system_id is not None:
+            for_s, left_s[change.system_id] = left_s[change.system_id] - change.time_s, change.time_s
+            mode = Mode[change.text.rpartition(" ")[2]]
+            if mode in in_mode_s:
+                in_mode_s[mode][change.system_id] += for_s
+    found = {mode: {own: s for own, s in of.items() if s > 0.0} for mode, of in in_mode_s.items()}
+    return ", ".join(
+        f"{vehicles_text([*of])} {mode.name} for {'up to ' * (len(of) > 1)}{max(of.values()):.2f} s"
+        for mode, of in found.items()
+        if of
+    )
 
 
 def _spread_text(spread: FlownSpread) -> str:

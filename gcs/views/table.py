@@ -25,7 +25,17 @@ from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.mismatch import assumption
 from gcs.runs.refusals import REFUSED
-from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, growth_text, ms_text, not_shown, number_text
+from gcs.views.console import (
+    UNKNOWN,
+    FittedColumn,
+    draw,
+    fitted_table,
+    growth_text,
+    ms_text,
+    not_shown,
+    number_text,
+    vehicles_text,
+)
 from gcs.views.scene import Newest
 from scenarios.schema import Scenario
 
@@ -35,7 +45,6 @@ PLAIN_EVERY_S = 5.0
 EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
 """Equal events within this time share a line."""
-NAMED_MAX = 12
 _NEVER = sys.maxsize
 """Terminal width from which a column is shown that a flight has no use for."""
 
@@ -92,12 +101,12 @@ class FlightState:
 
     def at_delay(self, figures: "Figures") -> str:
         """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
-        delay_s, gain_set = _worst(figures.loop_delay_s_p50), int(self.newest["gain_set"].max(initial=0))
+        delay_s = _worst(figures.loop_delay_s_p50)
         if np.isnan(delay_s):
             return ""
-        key = round(1e3 * delay_s), gain_set
+        key = round(1e3 * delay_s), figures.gain_set
         if key not in self._at_delay:
-            found = figures_at(self._design, self.scenario, key[0] / 1e3, gain_set)
+            found = figures_at(self._design, self.scenario, key[0] / 1e3, figures.gain_set)
             grows = f", errors {growth_text(found.string_peak)}" if found.has_string_verdict else ""
             text = "" if found.alpha is None else f"alpha {found.alpha:.3f}{grows} at {key[0]} ms"
             self._at_delay[key] = text
@@ -135,11 +144,12 @@ class FlightState:
         self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
 
     def figures(self) -> "Figures":
-        """The figures to be shown; NaN where unknown."""
-        now = self.newest
-        heard = self._window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
-        loop_delay_s, headroom = (np.where(heard, self._window[name], np.nan) for name in ("loop_delay_s", "headroom"))
-        late_s = (self._window["sent_ns"].max(axis=1, keepdims=True) - self._window["due_ns"][:, :1]) / 1e9
+        """The figures to be shown; NaN where unknown. At the end they are those of the last commands of the flight."""
+        now, flown = self.newest, self._window[self._window["commanded"].any(axis=1)]
+        window = flown if flown.size else self._window
+        heard = window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
+        loop_delay_s, headroom = (np.where(heard, window[name], np.nan) for name in ("loop_delay_s", "headroom"))
+        late_s = (window["sent_ns"].max(axis=1, keepdims=True) - window["due_ns"][:, :1]) / 1e9
         return Figures(
             spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
             loop_delay_s_p50=_quantile(loop_delay_s, 0.5),
@@ -147,6 +157,7 @@ class FlightState:
             headroom=_quantile(headroom, 0.0),
             modes=[Mode(int(mode)) for mode in now["mode"]],
             lateness_s_p99=float(_quantile(late_s, 0.99)[0]),
+            gain_set=int(window["gain_set"][-1:].max(initial=0)),
         )
 
 
@@ -160,6 +171,8 @@ class Figures:
     headroom: FloatArray
     modes: list[Mode]
     lateness_s_p99: float
+    gain_set: int
+    """The slowest that any vehicle is flown with."""
 
     def worst_first(self) -> list[int]:
         """Indices of vehicles: first those in the worst mode, within a mode those with the least headroom."""
@@ -239,7 +252,7 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
     flown = [Text(at_delay, no_wrap=True)] if (at_delay := state.at_delay(figures)) else []
     text = assumption(state.scenario)
     if text and state.without_target:
-        text = f"{text}: {_vehicles_text(sorted(state.without_target))}"
+        text = f"{text}: {vehicles_text(sorted(state.without_target))}"
     assumed = [Text(f"assumed: {text}", style="dim", no_wrap=True)] if text else []
     return [line, *flown, *refused, *assumed, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
 
@@ -273,15 +286,9 @@ def at_once(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
 
 def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
     """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
-    who = f"{_vehicles_text(system_ids)}: " if system_ids else ""
+    who = f"{vehicles_text(system_ids)}: " if system_ids else ""
     kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # or the word would appear twice
     return f"{time_text(event.time_s, before_s)}  {kind}{who}{event.text}"
-
-
-def _vehicles_text(system_ids: list[int]) -> str:
-    named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
-    more = f" and {len(system_ids) - NAMED_MAX} more" if len(system_ids) > NAMED_MAX else ""
-    return f"vehicle{'s' * (len(system_ids) > 1)} {named}{more}"
 
 
 class Display:

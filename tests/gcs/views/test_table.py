@@ -56,6 +56,15 @@ def test_the_figures_forget_what_was_before_the_last_seconds() -> None:
     assert row_of(drawn(state), 1)[8] == "80"
 
 
+def test_at_the_end_the_figures_are_those_of_the_last_commands() -> None:
+    """Vehicles that hold are back at the fastest gains, whose headroom nobody flies with."""
+    ticks = ticks_of(line(2), start_s=0.0, count=60)
+    ticks["commanded"][:50], ticks["gain_set"][:50], ticks["headroom"][:50] = True, 1, 0.4
+    ticks["headroom"][50:] = -0.5
+    figures = flown(line(2), ticks).figures()
+    assert (figures.gain_set, figures.headroom.tolist()) == (1, [0.4, 0.4])
+
+
 def test_the_age_of_a_lost_vehicle_is_no_loop_delay() -> None:
     ticks = ticks_of(line(3), start_s=0.0, count=50)
     ticks["loop_delay_s"], ticks["headroom"] = 0.05, 0.8

@@ -1,0 +1,25 @@
+"""What is said of a flight as a whole."""
+
+from gcs import fly_virtual
+from gcs.views.report import flight_lines
+from scenarios.files import load
+from scenarios.keys.link import Link, Links, Outage, VehicleLinks
+from scenarios.shipped import located
+
+
+def test_a_flight_that_settled_says_how_long_vehicles_were_out_of_hand() -> None:
+    """The last vehicle is silent for 4 s, after which it is in failsafe for a tick or two."""
+    calm = Link(delay_s=0.02)
+    silent = calm.model_copy(update={"outages": (Outage(from_s=10.0, until_s=14.0),)})
+    links = Links(up=calm, down=calm, vehicles=(VehicleLinks(system_id=3, up=silent, down=silent),))
+    summary = fly_virtual(load(located("chain3")).model_copy(update={"links": links})).summary
+    assert summary.verdict == "stable"
+    in_failsafe, lost, critical = flight_lines(summary)["modes"].split(", ")
+    assert in_failsafe == "vehicle 3 FAILSAFE for 0.04 s"
+    assert lost == "vehicle 3 LOST for 2.52 s"
+    assert critical.startswith("vehicle 3 CRITICAL for 0.")
+
+
+def test_a_flight_in_hand_throughout_says_nothing_of_modes() -> None:
+    calm = load(located("chain3")).model_copy(update={"duration_s": 5.0})
+    assert "modes" not in flight_lines(fly_virtual(calm).summary)
