@@ -261,6 +261,13 @@ class LinkPart(Published):
     candidates: tuple[GainsAtDelay, ...] = ()
 
 
+class OwnMargins(Published):
+    """What the loop delay of one vehicle may be with each gain set; None without a limit."""
+
+    system_id: int
+    delay_margins_s: tuple[Margin, ...]
+
+
 class Design(Published):
     """The gains of a scenario, their margins and other figures, and the proofs; fields as published in design.json.
 
@@ -280,6 +287,8 @@ class Design(Published):
     delay_margin_continuous_s: Margin = None
     margin_over_links: bool = False
     """Whether the sampled margin is that over the scenario's links, which differ; the continuous one never is."""
+    own_margins: tuple[OwnMargins, ...] = ()
+    """Of the vehicles that are not judged by the margins of the schedule."""
     period_s: float = 0.0
     vehicles: int = 0
     leader: BlockMargin | None = None

@@ -24,6 +24,7 @@ from gcs.plan.design import (
     Design,
     GainSet,
     LinkPart,
+    OwnMargins,
     PredictionPart,
     ResponsePart,
     TradeOffPoint,
@@ -137,7 +138,14 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
     over_links = design.with_schedule(_with_margins(design, flown.margins_s, continuous_s))
-    return over_links.model_copy(update={"margin_over_links": True}), flown
+    return _with_own_margins(over_links.model_copy(update={"margin_over_links": True}), flown), flown
+
+
+def _with_own_margins(design: Design, plan: FlightPlan) -> Design:
+    """The design with the margins of single vehicles that its plan is flown by."""
+    every = zip(plan.formation.system_ids, map(plan.own_margins_s.get, range(plan.model.vehicles)), strict=True)
+    own = tuple(OwnMargins(system_id=k, delay_margins_s=tuple(map(plain, own_s))) for k, own_s in every if own_s)
+    return design.model_copy(update={"own_margins": own})
 
 
 def with_trade_off(design: Design) -> Design:
@@ -159,6 +167,7 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
         plan = replace(plan, own_margins_s=unlimited(plan))
+        design = _with_own_margins(design, plan)
     if plan.scenario.control.prediction != "off":
         design = design.model_copy(update={"prediction": _prediction(plan)})
     design = with_figures_at_delay(design, plan)

@@ -10,8 +10,8 @@ the formation, so errors are relative to the formation as designed. Lateness is 
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from math import nan
+from dataclasses import dataclass, field, replace
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from gcs.control.loops import Moment, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
@@ -77,9 +78,9 @@ class _OpenTick:
     commands: _Commands = field(default_factory=dict[int, tuple[int, Vector]])
 
 
-def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:
-    """The flight of a scenario in a log; `margins_s` are those of the gain schedule, fastest first."""
-    flight = _Rebuilding(scenario, margins_s, _outline(frames, scenario))
+def rebuild(frames: Frames, scenario: Scenario, design: Design) -> Rebuilt:
+    """The flight of a scenario in a log, judged by the margins of a design."""
+    flight = _Rebuilding(scenario, design, _outline(frames, scenario))
     for time_ns, frame in frames:
         flight.take(time_ns, frame)
     return flight.finished()
@@ -124,22 +125,31 @@ def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
-def _plan(scenario: Scenario, margins_s: tuple[float, ...]) -> FlightPlan:
-    """The plan that defines the errors; it has gains only where the latencies depend on them."""
+def _plan(scenario: Scenario, design: Design) -> FlightPlan:
+    """The plan that defines the errors and by which the flight is judged; it has gains only where latencies depend on
+    them."""
     # which states a streamed command needs depends on the gains, and so does the window of a predicted loop
     if onboard_timing(scenario) is not None or scenario.control.prediction != "off":
-        return flight_plan(scenario)[1]
-    formation = plan_formation(scenario)
-    K = np.zeros((formation.model.inputs, formation.model.states))
-    return FlightPlan(scenario, formation, K, margins_s[0], tuple((K, margin_s) for margin_s in margins_s[1:]))
+        plan = flight_plan(scenario)[1]
+        if len(design.margins_s) == len(plan.margins_s):
+            plan = plan.with_margins(design.margins_s, plan.responses)
+    else:
+        formation, (margin_s, *slower_s) = plan_formation(scenario), design.margins_s
+        K = np.zeros((formation.model.inputs, formation.model.states))
+        plan = FlightPlan(scenario, formation, K, margin_s, tuple((K, own_s) for own_s in slower_s))
+    row = plan.formation.row
+    own_s = {
+        row(own.system_id): tuple(inf if s is None else s for s in own.delay_margins_s) for own in design.own_margins
+    }
+    return replace(plan, own_margins_s={**plan.own_margins_s, **own_s})
 
 
 class _Rebuilding:
     """Rebuilds, frame by frame, what the station knew of the vehicles."""
 
-    def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
+    def __init__(self, scenario: Scenario, design: Design, outline: _Outline) -> None:
         self._scenario, self._outline = scenario, outline
-        self._fleet = fleet_of(_plan(scenario, margins_s), ignored)
+        self._fleet = fleet_of(_plan(scenario, design), ignored)
         ids = self._fleet.plan.formation.system_ids
         self._repetitions = Repetitions(scenario.rates, len(ids))
         self.watch = Watch(ids)
@@ -276,7 +286,7 @@ class _Rebuilding:
         ids = [vehicle.remote.system_id for vehicle in self._vehicles]
         sent = [commands.get(system_id, (sent_ns, None)) for system_id in ids]
         controls["command_m_s2"] = [one or (nan, nan) for _, one in sent]
-        tolerated = [self._fleet.plan.tolerance(assumed_s) for assumed_s in controls["assumed_s"].tolist()]
+        tolerated = [self._fleet.plan.tolerance_of(*own) for own in enumerate(controls["assumed_s"].tolist())]
         judged = Judged(
             np.array(ids), np.array([int(state.mode) for state in self._states]),
             np.array([state.gain_set for state in self._states]), controls, self._reported,

@@ -84,7 +84,7 @@ def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
     """The summary of a log, with the figures that were recorded if it is in the folder of a run."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
     scenario, design = source.scenario, source.design or Design(delay_margin_s=None)
-    rebuilt = None if scenario is None else rebuild(log.frames, scenario, design.margins_s)
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, design)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
     flight = None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt)
     parts = {"flight": flight, "recorded": source.recorded}

@@ -16,6 +16,7 @@ from gcs.watch.rebuild import rebuild
 from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
+from scenarios.keys.link import Link, Links, VehicleLinks
 from scenarios.schema import Scenario
 from tests.support.fleets.delay_ramp import ramp
 from tests.support.fleets.logged_flight import EPOCH_NS, flown, log_bytes
@@ -31,6 +32,8 @@ FLIGHTS: dict[str, tuple[str, float, float | None]] = {
     "gains change": ("triangle5", 40.0, None),
     "autopilots": ("copters5", 5.0, None),
     "loops on board": ("chain3", 5.0, None),
+    "predicted on board": ("chain3", 5.0, 0.1),
+    "links that differ": ("chain3_bidirectional", 8.0, None),
 }
 """Scenario, duration in s, link delay in s."""
 MICROSECOND = 2e-6
@@ -42,8 +45,14 @@ def scenario_of(flight: str) -> Scenario:
     scenario = load(SCENARIOS / f"{name}.toml").model_copy(update={"duration_s": duration_s})
     if flight == "gains change":
         return scenario.model_copy(update={"links": ramp(0.44)})
-    if flight == "loops on board":
-        return scenario.model_copy(update={"control": scenario.control.model_copy(update={"loop": "onboard"})})
+    if flight == "links that differ":
+        quick, slow = Link(delay_s=0.02), Link(delay_s=0.12)
+        unlike = Links(up=quick, down=quick, vehicles=(VehicleLinks(system_id=3, up=slow, down=slow),))
+        return scenario.model_copy(update={"links": unlike})
+    if flight.endswith("on board"):
+        prediction = 0.2 if flight.startswith("predicted") else "off"
+        changed = {"loop": "onboard", "prediction": prediction}
+        scenario = scenario.model_copy(update={"control": scenario.control.model_copy(update=changed)})
     return scenario if delay_s is None else scenario.with_link_delay(up_s=delay_s, down_s=delay_s)
 
 
@@ -86,7 +95,8 @@ def test_latencies_and_headroom_are_those_of_the_flight(flight: str) -> None:
             expected = pytest.approx(getattr(getattr(was, name), quantile), abs=bound_s)
             assert getattr(getattr(found, name), quantile) == expected, (name, quantile)
     if flight != "autopilots":  # their margins are known only once they have been identified
-        assert rebuilt.headroom_min == pytest.approx(summary.headroom_min, abs=10 * bound_s)
+        for was, found in ((summary, rebuilt), *zip(summary.vehicles, rebuilt.vehicles, strict=True)):
+            assert found.headroom_min == pytest.approx(was.headroom_min, abs=10 * bound_s)
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
@@ -149,7 +159,7 @@ def test_another_tools_log_gives_links_and_errors_but_no_verdict(requests: bool)
         assert links.rtt_s.p50 == (pytest.approx(0.04, abs=MICROSECOND) if requests else None)
         assert links.loop_delay_s.status == ("measured" if requests else "lower bound")
         assert (known(links.loop_delay_s.p50) < 0.04) != requests
-    rebuilt = rebuild(log.frames, scenario, (0.3,)).ticks
+    rebuilt = rebuild(log.frames, scenario, Design(delay_margin_s=0.3)).ticks
     for system_id in (2, 3):
         was, found = (rows[rows["system_id"] == system_id] for rows in (ticks[ticks["time_s"] >= 0], rebuilt))
         log_ns = was["due_ns"] + EPOCH_NS

@@ -8,7 +8,7 @@ import numpy as np
 from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
-from gcs.plan.planner import flight_plan
+from gcs.plan.planner import flight_plan, over_own_links
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
@@ -39,7 +39,7 @@ def log_bytes(entries: list[tuple[int, bytes]]) -> bytes:
 
 def flown(scenario: Scenario) -> tuple[Design, Summary, TickArray, list[tuple[int, bytes]]]:
     """The design, the summary and the ticks of a flight, and the entries of its log."""
-    design, plan = flight_plan(scenario)
+    design, plan = over_own_links(*flight_plan(scenario))
     station, vehicles = Station(plan, start_ns=START_NS), Logged(vehicles_of(plan.scenario))
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=vehicles)))
     events = [*station.events, Event(time_s=0.0, kind="end", text=station.end_reason)]
