@@ -93,7 +93,7 @@ def monitor(
                 link,
                 watch,
                 stop_reason,
-                margin_s=None if given is None else given.delay_margin_s,
+                design=given,
                 margin_of=margin_of,
                 timesync_hz=0.0 if silent else asked_hz,
                 position_hz=position_hz if request else 0.0,

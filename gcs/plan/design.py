@@ -339,6 +339,11 @@ class Design(Published):
             return (nan,) * len(every)
         return tuple(inf if margin_s is None else margin_s for margin_s in every)
 
+    def margin_of(self, system_id: int) -> float | None:
+        """The delay margin (s) of a vehicle with the fastest gains; None without a limit."""
+        own = {each.system_id: each.delay_margins_s[0] for each in self.own_margins}
+        return own.get(system_id, self.delay_margin_s)
+
     def with_schedule(self, schedule: tuple[GainSet, ...], **parts: Published | str) -> Self:
         """The design with another schedule, of which the first entry gives its margins, and with other parts."""
         first = schedule[0]

@@ -86,7 +86,7 @@ def measured_now(
             link,
             found.watch,
             ended,
-            margin_s=None,
+            design=None,
             margin_of="",
             timesync_hz=_TIMESYNC_HZ,
             position_hz=scenario.rates.telemetry_hz,

@@ -11,6 +11,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable
 from math import nan
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
 from scenarios.schema import NS_PER_S
+
+if TYPE_CHECKING:
+    from gcs.plan.design import Design
 
 SYSTEM_ID = 254
 """System id of the watch's requests. Not a station's: vehicles track the sequence numbers of theirs."""
@@ -248,9 +252,10 @@ class Watch:
                 vehicle.look(now_ns)
         return self._look_ns
 
-    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[LinkFigures]:
-        """The figures of each vehicle, in order of system id."""
-        return [self.vehicles[system_id].figures(now_ns, margin_s, last) for system_id in sorted(self.vehicles)]
+    def figures(self, now_ns: int, design: "Design | None", last: int = 0) -> list[LinkFigures]:
+        """The figures of each vehicle, in order of system id, with the headroom to its margin in a design."""
+        margins_s = {own: None if design is None else design.margin_of(own) for own in sorted(self.vehicles)}
+        return [self.vehicles[own].figures(now_ns, margin_s, last) for own, margin_s in margins_s.items()]
 
     def _vehicle(self, frame: mavlink.Frame) -> WatchedVehicle | None:
         known = self.vehicles.get(frame.system_id)

@@ -7,6 +7,7 @@ sends no heartbeat, so that a vehicle notices when its station is gone.
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
@@ -15,6 +16,9 @@ from gcs.watch.links import Requests, Watch, WatchReport, prepare
 from gcs.watch.saved_links import LinkRecorder
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S
+
+if TYPE_CHECKING:
+    from gcs.plan.design import Design
 
 _SHOW_NS = NS_PER_S // 4
 _PLAIN_NS = 5 * NS_PER_S
@@ -27,7 +31,7 @@ def watch_links(
     watch: Watch,
     stop_reason: Callable[[], str],
     *,
-    margin_s: float | None,
+    design: "Design | None",
     margin_of: str,
     timesync_hz: float,
     position_hz: float,
@@ -37,9 +41,9 @@ def watch_links(
 ) -> WatchReport:
     """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time.
 
-    `margin_of` says where the margin is from. `timesync_hz` is the rate of requests to each address, 0 to send nothing.
-    Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder` notes every frame
-    that `watch` takes.
+    `margin_of` says where the margins of `design` are from. `timesync_hz` is the rate of requests to each address, 0 to
+    send nothing. Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder` notes
+    every frame that `watch` takes.
     """
     prepare()
     requests = Requests(timesync_hz, position_hz)
@@ -50,14 +54,14 @@ def watch_links(
         return WatchReport(
             listening="{}:{}".format(*link.address),
             duration_s=round((now_ns - start_ns) / NS_PER_S, 3),
-            delay_margin_s=margin_s,
+            delay_margin_s=None if design is None else design.delay_margin_s,
             margin_of=margin_of,
             silent=timesync_hz == 0,
             sent={"TIMESYNC": requests.sent, "SET_MESSAGE_INTERVAL": requests.positions_asked},
             send_errors=link.send_errors,
             stations=tuple(sorted(watch.stations)),
             refused=dict(watch.counters),
-            vehicles=tuple(watch.figures(now_ns, margin_s, last)),
+            vehicles=tuple(watch.figures(now_ns, design, last)),
         )
 
     with live_display(shown=shown, transient=True) as live:

@@ -97,7 +97,7 @@ def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
         ),
         delay_margin_s=design.delay_margin_s,
         stations=tuple(sorted(watch.stations)),
-        links=tuple(watch.figures(last_ns, design.delay_margin_s)),
+        links=tuple(watch.figures(last_ns, design)),
         **{name: part for name, part in parts.items() if part is not None},
     )
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
+from gcs.plan.design import Design, OwnMargins
 from gcs.watch.links import SYSTEM_ID, Requests, Watch, WatchReport
 from gcs.watch.table import NOT_ASKED, links_table, render
 from scenarios.files import load
@@ -92,11 +93,14 @@ def test_round_trips_and_loop_delays_match_links_to_the_microsecond(late_ns: int
     assert told.sum() > 30
     np.testing.assert_allclose(late_s[told], -0.02, atol=1e-5)
     np.testing.assert_allclose((np.array(vehicle.loop_delay_s) - watched.true_ages_s)[told], 0.03, atol=1e-5)
-    figures = watched.watch.figures(watched.now_ns, 0.5)[0]
+    figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.5))[0]
     # Half a round trip, and what a clock may drift since the newest reply was read, by then 0.05 to 0.2 s ago.
     assert 0.05 < known(figures.clock.bound_s) < 0.05 + 1e-3 * 0.25
     assert figures.headroom == pytest.approx(1 - known(figures.loop_delay_s.p99) / 0.5)
     assert figures.status == "measured"
+    own = OwnMargins(system_id=1, delay_margins_s=(0.05, 0.1))
+    figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.5, own_margins=(own,)))[0]
+    assert figures.status == "past the margin"
 
 
 def test_silence_gives_lower_bounds_that_hold_and_rise_with_jitter() -> None:
@@ -113,7 +117,7 @@ def test_silence_gives_lower_bounds_that_hold_and_rise_with_jitter() -> None:
     assert (short_s > 0).all()
     # After some seconds a frame with nearly the least delay, 30 ms, has come: that much is never seen.
     assert 0.03 - 0.001 < short_s[-30:].min() <= short_s[-30:].max() < 0.04
-    assert watched.watch.figures(watched.now_ns, 0.3)[0].status == "no exchange"
+    assert watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3))[0].status == "no exchange"
 
 
 def test_another_stations_exchanges_on_the_stream_are_used_without_asking() -> None:
@@ -205,7 +209,7 @@ def test_any_stream_is_taken_and_figures_are_plain_numbers(
         for frame in mavlink.decode(data, Counter()):
             watch.take(frame, now_ns)
         watch.look(now_ns)
-    [figures] = watch.figures(now_ns, 0.3)
+    [figures] = watch.figures(now_ns, Design(delay_margin_s=0.3))
     assert figures.system_id == 1
     figures.to_json()  # which has no infinity
 
@@ -214,7 +218,7 @@ def test_any_stream_is_taken_and_figures_are_plain_numbers(
 def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
     watched.run(1.5)
-    figures = watched.watch.figures(watched.now_ns, 0.3)
+    figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3))
     console = Console(file=io.StringIO(), width=width, color_system=None)
     with console.capture() as capture:
         console.print(links_table(figures, width))
