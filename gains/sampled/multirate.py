@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import met_end, peaks
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gains.core.structure import positive_seconds, seconds
 from gains.delay.constant import delay_margin
 from gains.sampled._loop import HeldPlant, SampledPlant, block_radius, held_blocks, radius_of, rate_of
@@ -288,3 +288,31 @@ def first_unstable(radius: Callable[[float], float], looks: list[float]) -> floa
 def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:
     met, missed = ((delay_s, 1.0 - radius(delay_s)) for delay_s in (stable_s, unstable_s))
     return met_end(lambda delay_s: 1.0 - radius(delay_s), met, missed, resolution=_RESOLUTION)
+
+
+def effective_delay_s(commands: IntArray, *, held_s: float) -> float:
+    """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
+
+    T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
+    newer state acts, T / 2 on average when all arrive. Unlike the median of the loop
+    delays, this accounts for commands that never arrived. Where delays change fast compared with the loop's motion,
+    only the mean age matters, to first order.
+
+    Parameters
+    ----------
+    commands
+        (k, 2) in ns and in order: when each acted, and when the state behind it was sampled.
+
+    Every 20 ms a state acts that is 0.1 s old; then one command is lost:
+
+    >>> import numpy as np
+    >>> acted_ns = np.array([0, 20, 40, 60, 100]) * 1_000_000
+    >>> commands = np.column_stack([acted_ns, acted_ns - 100_000_000])
+    >>> [round(effective_delay_s(some, held_s=0.02), 6) for some in (commands[:4], commands)]
+    [0.1, 0.104]
+    """
+    if len(commands) < 2:
+        return 0.0
+    acted_ns, sampled_ns = commands[:, 0], commands[:-1, 1]
+    acting_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
+    return float((acting_s * (late_s + acting_s / 2.0)).sum() / acting_s.sum()) - held_s / 2.0

@@ -181,8 +181,8 @@ def over_own_links(file: Path, design: "Design", plan: "FlightPlan") -> "tuple[D
     design, flown = planner.over_own_links(design, plan)
     if flown is not plan:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)
-        finding = f"the margin is {own} for the slowest of them, {alike} if links were alike"
-        warn(file, f"vehicles share a loop over links that differ: {finding}")
+        finding = f"the margin is {own} for the slowest of them, {alike} if delays were alike"
+        warn(file, f"vehicles share a loop, and their loop delays differ: {finding}")
     return design, flown
 
 

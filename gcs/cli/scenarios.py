@@ -12,6 +12,9 @@ from gcs.cli.front import chosen_for
 from gcs.errors import InputError
 from scenarios.networks import MOST_VEHICLES
 
+_LONGER = 1.01
+"""How many times the expected loop delay an effective one is that is worth a line."""
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -128,6 +131,9 @@ def check(
     else:
         design, plan = options.over_own_links(scenario_file, design, plan)
     found = checked(plan)
+    if assert_headroom is not None and not found.response_known:
+        read, wanted = "autopilots that are identified in flight", "a [response] in the scenario, which makes it known"
+        options.refuse(scenario_file, f"--assert-headroom: read {read}, wanted {wanted}", in_file=False)
     options.answer(found, partial(_print_check, design), as_json=as_json)
     if assert_headroom is not None and (unmet := options.unmet_headroom(found.headroom_p99, assert_headroom)):
         options.say_failed(unmet)
@@ -158,6 +164,14 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links{whose}, {margin}, "
         f"headroom {number_text(found.headroom, '.0%')}{unstable}"
     )
+    if not found.response_known:
+        console.print(
+            "         if the vehicles responded at once: how autopilots respond is known once they are identified"
+        )
+    if found.effective_loop_delay_s > _LONGER * found.expected_loop_delay_s:
+        past = "" if (found.effective_headroom or 0.0) > 0.0 else ": unstable"
+        effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
+        console.print(f"         where datagrams are lost, older commands act on: as a loop delay of {effective}{past}")
     late = f"loop at most {ms_text(found.loop_delay_s_p99)}, headroom at least {number_text(found.headroom_p99, '.0%')}"
     console.print(f"         for 99 % of the set-points: {late}")
     if found.channels_not_included:

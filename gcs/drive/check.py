@@ -9,7 +9,13 @@ from pydantic import Field
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
-from gcs.plan.expected_delay import DrawnDelays, drawn_delays, planned_loop_delays_s, waits_for_channels
+from gcs.plan.expected_delay import (
+    DrawnDelays,
+    drawn_delays,
+    effective_loop_delays_s,
+    planned_loop_delays_s,
+    waits_for_channels,
+)
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.loops import link_delays_left_s
@@ -19,6 +25,8 @@ from gcs.published import Published
 from scenarios.schema import Scenario
 
 _LATE = 0.99
+_WAITS = 101
+"""Waits for the tick that are looked at, from none to the longest."""
 
 
 class VehicleCheck(Published):
@@ -69,6 +77,11 @@ class ScenarioCheck(Published):
     """A scenario before its flight."""
 
     expected_loop_delay_s: float
+    effective_loop_delay_s: float
+    """The constant loop delay that decides about stability: with links that lose datagrams it is longer, because older
+    commands act on. Of the vehicle that it leaves least headroom."""
+    effective_headroom: float | None
+    """The headroom at that delay."""
     channels_not_included: bool
     """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
     delay_margin_s: float | None
@@ -94,6 +107,9 @@ class ScenarioCheck(Published):
     planned: tuple[PlannedMotionCheck, ...]
     """Of each vehicle, if the formation manoeuvres."""
     vehicles: tuple[VehicleCheck, ...]
+    response_known: bool
+    """False for autopilots, which are identified in flight, unless the scenario has their response: margins and
+    headroom are then those of vehicles that respond at once, and less in flight."""
     response_differs: dict[str, tuple[float | None, float | None]]
     """The keys in which the given `response` differs from the simulated `autopilot`: the value of each."""
     code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
@@ -122,7 +138,6 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         turning = (limits.turn_rate_max_rad_s or inf) * hypot(*vehicle.velocity_ne_m_s)
         most = min(limits.acceleration_max_m_s2 or inf, turning)
         own = vehicle.system_id
-        margin_s, used_s = _margin_and_used_s(plan, row, delays_s[own])
         vehicles.append(
             VehicleCheck(
                 system_id=vehicle.system_id,
@@ -132,8 +147,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
                 expected_loop_delay_s=delays_s[own],
-                headroom=_known(headroom(used_s, margin_s)),
-                link_delay_left_s=_known(left_s.get(own, margin_s - used_s)),
+                headroom=_known(_headroom(plan, row, delays_s[own])),
+                link_delay_left_s=_known(left_s.get(own, plan.tolerance_of(row, delays_s[own]).longer_s[0])),
             )
         )
     delay_s = max(delays_s.values())
@@ -142,10 +157,14 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     tolerated = plan.tolerance(assumed_s)
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
-    drawn = drawn_delays(plan)
+    drawn, effective_s = drawn_delays(plan), effective_loop_delays_s(plan)
+    left = {own: _headroom(plan, row, effective_s[own]) for row, own in enumerate(formation.system_ids)}
+    critical = min(left, key=left.__getitem__)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
+        effective_loop_delay_s=effective_s[critical],
+        effective_headroom=_known(left[critical]),
         channels_not_included=waits_for_channels(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
         assumed_delay_s=assumed_s if is_predicted else None,
@@ -158,6 +177,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         course=_course(scenario) if scenario.course.is_smooth else None,
         planned=tuple(_planned(scenario, formation)) if scenario.manoeuvres else (),
         vehicles=tuple(vehicles),
+        response_known=scenario.dynamics != "autopilot" or plan.responses is not None,
         response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
@@ -168,26 +188,31 @@ def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
     return delay_s if plan.scenario.control.prediction == "measured" else plan.assumed_s or 0.0
 
 
-def _margin_and_used_s(plan: FlightPlan, row: int, delay_s: float) -> tuple[float, float]:
-    """The margin (s), and how much of it a loop delay uses; with prediction of the distance to the window's end."""
+def _headroom(plan: FlightPlan, row: int, delay_s: float) -> float:
+    """What a loop delay leaves of a vehicle's margin; with prediction of the distance to the window's end."""
     assumed_s = _assumed_s(plan, delay_s)
     tolerated = plan.tolerance_of(row, assumed_s)
-    return tolerated.longer_s[0], tolerated.used_s(0, delay_s - assumed_s)
+    return headroom(tolerated.used_s(0, delay_s - assumed_s), tolerated.longer_s[0])
 
 
 def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | None:
     """The headroom that most set-points keep.
 
     With prediction the age of a state is known, so only a set-point that acts at another instant than assumed is a
-    mismatch. A measured delay is assumed to be the mean.
+    mismatch. A measured delay is assumed to be the mean, and includes the wait for the tick. With a given one that
+    wait, which is the same throughout a flight, may be shorter or longer than on average.
     """
     prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
+    rates = plan.scenario.rates
+    waits_s = np.linspace(-0.5, 0.5, _WAITS) / max(rates.telemetry_hz, rates.control_hz)
     for row, system_id in enumerate(plan.formation.system_ids):
         own = drawn[system_id]
         assumed_s = _assumed_s(plan, float(own.loop_s.mean()))
         tolerated = plan.tolerance_of(row, assumed_s)
         if (kind := (id(own), tolerated)) not in late:
             mismatch_s = own.loop_s if prediction == "off" else own.down_s + own.ages_s.mean() - assumed_s
+            if prediction not in {"measured", "off"}:
+                mismatch_s += np.resize(waits_s, len(mismatch_s))
             used_s = [tolerated.used_s(0, each_s) for each_s in mismatch_s.tolist()]
             late[kind] = headroom(float(np.quantile(used_s, _LATE)), tolerated.longer_s[0])
     return _known(min(late.values()))

@@ -8,23 +8,28 @@ faster than this.
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from math import ceil
+from math import ceil, inf
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
+from gains.sampled.multirate import effective_delay_s
 from gains.sampled.onboard import own_part
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.keys.link import Link
 from scenarios.keys.part import HELD_SHARE
-from scenarios.schema import Scenario
+from scenarios.schema import NS_PER_S, Scenario
 
 _SECONDS = 200.0
 """Time over which datagrams are drawn: at 50 Hz the median then has a standard error of about 1 % of the spread."""
 _MOST = 20_000
 """Most datagrams drawn in one direction."""
+_PHASES = 25
+"""Draws of the phases at which several vehicles report."""
+_SAME_S, _NEVER = 1e-9, 1e-12
 
 
 _Way = tuple[tuple[Link, ...], Link]
@@ -81,10 +86,12 @@ def expected_loop_delays_s(
     """
     ways = _ways(scenario, heard)
     unlike = dict.fromkeys(ways.values())
-    if any(link.jitter or link.loss_probability or link.loss_bursts for ups, down in unlike for link in (*ups, down)):
+    rates = scenario.rates
+    in_turn = rates.telemetry_hz < rates.control_hz and any(len(ups) > 1 for ups, _ in unlike)
+    if in_turn or any(link.jitter or _loses(link) for ups, down in unlike for link in (*ups, down)):
         around_s = {way: float(np.median(drawn.loop_s)) for way, drawn in _drawn(scenario, unlike).items()}
     else:
-        waiting_s = 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
+        waiting_s = 0.5 / max(rates.telemetry_hz, rates.control_hz)
         around_s = {
             (ups, down): max(up.delay_max_s for up in ups) + down.delay_max_s + waiting_s for ups, down in unlike
         }
@@ -113,19 +120,43 @@ def _ways(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int,
 
 def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays]:
     rng = np.random.default_rng(0)
-    ages_s = {up: _ages_s(scenario, up, rng) for up in dict.fromkeys(up for ups, _ in ways for up in ups)}
+    ages_s = {ups: _ages_s(scenario, ups, rng) for ups in dict.fromkeys(ups for ups, _ in ways)}
     late_s = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in ways)}
-    drawn: dict[_Way, DrawnDelays] = {}
-    for ups, down in ways:
-        oldest_s = _oldest_s([ages_s[up] for up in ups], rng)
-        drawn[ups, down] = DrawnDelays(oldest_s, rng.choice(late_s[down], len(oldest_s)))
-    return drawn
+    return {(ups, down): DrawnDelays(ages_s[ups], rng.choice(late_s[down], len(ages_s[ups]))) for ups, down in ways}
 
 
-def _oldest_s(ages_s: Sequence[FloatArray], rng: np.random.Generator) -> FloatArray:
-    """The ages (s) of the oldest of several states, drawn independently of each other."""
-    first, *others = ages_s
-    return np.maximum.reduce([first, *(rng.permutation(own) for own in others)])
+def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
+    """The constant loop delays (s) that those of a plan's vehicles amount to.
+
+    They are the expected ones but for links to the ground that lose datagrams: where no newer command arrives, the one
+    before it acts on (`gains.sampled.multirate.effective_delay_s`).
+    """
+    scenario, delays_s = plan.scenario, planned_loop_delays_s(plan)
+    links = {own: scenario.link_of(own) for own in delays_s}
+    if scenario.control.loop == "onboard" or not any(_loses(link) for way in links.values() for link in way):
+        return delays_s
+    rng, held_s = np.random.default_rng(0), plan.timing.held_s
+    found = {way: _effective_s(scenario, *way, held_s, rng) for way in dict.fromkeys(links.values())}
+    return {own: found[way] for own, way in links.items()}
+
+
+def _effective_s(scenario: Scenario, up: Link, down: Link, held_s: float, rng: np.random.Generator) -> float:
+    heard, period_s = _heard_over(scenario, up, rng), 1.0 / scenario.rates.control_hz
+    enters, out, main = _stream(down, scenario.rates.control_hz, scenario, rng)
+    late_s = (out - enters)[main > 0.0]
+    if not len(heard.arrived_s) or not np.isfinite(late_s).any():
+        return inf
+    at_all_phases_s = period_s + held_s / len(late_s)
+    ticks = heard.arrived_s[0] + np.arange(len(late_s)) * at_all_phases_s
+    kept = np.isfinite(late_s) & (ticks < heard.newest_s[-1])
+    ticks, late_s = ticks[kept], late_s[kept]
+    sampled_s = heard.newest_s[np.searchsorted(heard.arrived_s, ticks, side="right") - 1]
+    commands = np.rint(NS_PER_S * np.column_stack([ticks + late_s, sampled_s])).astype(np.int64)
+    return effective_delay_s(commands[np.argsort(commands[:, 0], kind="stable")], held_s=held_s)
+
+
+def _loses(link: Link) -> bool:
+    return bool(link.loss_probability or link.loss_bursts)
 
 
 def waits_for_channels(scenario: Scenario) -> bool:
@@ -150,7 +181,7 @@ def _stream(
     enters, main = enters[order], (order < len(often)).astype(float)
     jitter_s = 0.0 if link.jitter is None else link.jitter.drawn_s(len(enters), rng)
     out = enters + np.maximum(0.0, link.delay_max_s + jitter_s)
-    lost = rng.random(len(enters)) < _loss(link)
+    lost = _lost(link, len(enters), rng)
     out[lost] = -np.inf
     if not link.reordering:
         out = np.maximum.accumulate(out)
@@ -167,30 +198,67 @@ def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) 
     return np.maximum(arrived_s, np.percentile(arrived_s, 100.0 * HELD_SHARE))
 
 
-def _ages_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
-    """Ages of the newest state at random ticks, less how long slower telemetry was repeated."""
-    rates = scenario.rates
-    enters, out, main = _stream(link, rates.telemetry_hz, scenario, rng)
+class _Heard(NamedTuple):
+    """When states arrived at the station (s), in order, and the instant of the newest one known then (s), both (k,)."""
+
+    arrived_s: FloatArray
+    newest_s: FloatArray
+
+
+def _heard_over(scenario: Scenario, link: Link, rng: np.random.Generator) -> _Heard:
+    enters, out, main = _stream(link, scenario.rates.telemetry_hz, scenario, rng)
     known = (main > 0.0) & np.isfinite(out)
-    sampled, out = enters[known], out[known]
-    ticks = rng.uniform(0.0, enters[-1], _MOST // 2)
-    if not len(out):
-        return np.full(len(ticks), link.delay_max_s)
-    order = np.argsort(out, kind="stable")
-    arrived, newest = out[order], np.maximum.accumulate(sampled[order])
-    place = np.searchsorted(arrived, ticks, side="right") - 1
+    order = np.argsort(out[known], kind="stable")
+    return _Heard(out[known][order], np.maximum.accumulate(enters[known][order]))
+
+
+def _longest_repetition(scenario: Scenario) -> int:
+    """For how many ticks a state is repeated at most because telemetry is slower."""
+    return ceil(scenario.rates.control_hz / scenario.rates.telemetry_hz * (1.0 - 1e-4)) - 1
+
+
+def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -> FloatArray:
+    """Ages of the newest state at random ticks, less how long slower telemetry was repeated; of several, the oldest."""
+    every, period_s = [_heard_over(scenario, up, rng) for up in ups], 1.0 / scenario.rates.control_hz
+    if not all(len(own.arrived_s) for own in every):
+        return np.full(_MOST // 2, max(up.delay_max_s for up in ups))
+    if len(every) > 1:
+        return _oldest_s(scenario, every, rng)
+    [heard] = every
+    ticks = rng.uniform(0.0, heard.newest_s[-1], _MOST // 2)
+    place = np.searchsorted(heard.arrived_s, ticks, side="right") - 1
     ticks, place = ticks[place >= 0], place[place >= 0]
-    first = np.searchsorted(newest, newest[place], side="left")  # the arrival that brought this state
-    period_s = 1.0 / rates.control_hz
-    longest_s = (ceil(rates.control_hz / rates.telemetry_hz * (1.0 - 1e-4)) - 1) * period_s
-    repeated = np.minimum(np.floor((ticks - arrived[first]) / period_s) * period_s, longest_s)
-    ages = ticks - newest[place] - repeated
-    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, link.delay_max_s)
+    first = np.searchsorted(heard.newest_s, heard.newest_s[place], side="left")  # the arrival that brought this state
+    repeated = np.minimum(np.floor((ticks - heard.arrived_s[first]) / period_s), _longest_repetition(scenario))
+    ages = ticks - heard.newest_s[place] - repeated * period_s
+    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, ups[0].delay_max_s)
 
 
-def _loss(link: Link) -> float:
-    """Mean fraction of datagrams that are lost."""
+def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Generator) -> FloatArray:
+    """Ages (s) of the oldest of the newest states of several vehicles, less how long it was repeated.
+
+    Whose state is the oldest changes within a period of slower telemetry, with the phases of the vehicles, which are
+    drawn anew `_PHASES` times.
+    """
+    period_s, longest = 1.0 / scenario.rates.control_hz, _longest_repetition(scenario)
+    count = min(_MOST // 2 // _PHASES, int(0.25 * min(own.newest_s[-1] for own in every) / period_s))
+    k, found = np.arange(count), list[FloatArray]()
+    for _ in range(_PHASES):
+        ages_s = np.zeros(count)
+        for own in every:
+            ticks = rng.uniform(own.arrived_s[0], own.newest_s[-1] - count * period_s) + k * period_s
+            ages_s = np.maximum(ages_s, ticks - own.newest_s[np.searchsorted(own.arrived_s, ticks, side="right") - 1])
+        changed = np.diff(k * period_s - ages_s, prepend=-1.0) > _SAME_S
+        first = np.maximum.accumulate(np.where(changed, k, 0))
+        found.append((ages_s - np.minimum(k - first, longest) * period_s)[longest:])
+    return np.concatenate(found)
+
+
+def _lost(link: Link, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which of so many datagrams are lost."""
     if (bursts := link.loss_bursts) is None:
-        return link.loss_probability
-    bad = bursts.to_bad_probability / (bursts.to_bad_probability + bursts.to_good_probability)
-    return bad * bursts.loss_bad_probability + (1.0 - bad) * bursts.loss_good_probability
+        return rng.random(count) < link.loss_probability
+    to_bad, to_good = max(bursts.to_bad_probability, _NEVER), bursts.to_good_probability
+    lasts = np.column_stack([rng.geometric(to_bad, count), rng.geometric(to_good, count)])
+    is_bad = np.searchsorted(np.cumsum(lasts.ravel()), np.arange(count), side="right") % 2 == 1
+    return rng.random(count) < np.where(is_bad, bursts.loss_bad_probability, bursts.loss_good_probability)

@@ -11,7 +11,7 @@ from math import inf, isnan, nan
 
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
-from gcs.plan.expected_delay import planned_loop_delays_s
+from gcs.plan.expected_delay import effective_loop_delays_s, planned_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
@@ -143,7 +143,7 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
 
     In a shared loop on board it is not: a link up delays the commands of others, too.
     """
-    expected_s, windows, left_s = planned_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
+    now_s, windows, left_s = effective_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
         for system_id in block.system_ids:
             alone = len(block.system_ids) == 1
@@ -151,7 +151,7 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
             known = alone or (block.extrapolated is not None and len(block.system_ids) <= _MOST_SHARING)
             if key not in windows:
                 windows[key] = window_of(plan, system_id) if known else (0.0, nan)
-            left_s[system_id] = windows[key][1] - expected_s[system_id]
+            left_s[system_id] = windows[key][1] - now_s[system_id]
     return left_s
 
 

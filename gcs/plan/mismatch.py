@@ -32,13 +32,15 @@ _MOST_ON_THE_WAY = 2000
 def used_s(shorter_s: float, longer_s: float, mismatch_s: float) -> float:
     """How much of `longer_s` a mismatch (loop delay minus assumed) uses; one of -`shorter_s` uses all of it.
 
-    Infinite if the loop delay is shorter than assumed and no shorter one is tolerated.
+    Infinite if the loop delay is shorter than assumed and no shorter one is tolerated; nothing if every one is.
 
-    >>> used_s(0.1, 0.2, 0.05), used_s(0.1, 0.2, -0.05)
-    (0.05, 0.1)
+    >>> used_s(0.1, 0.2, 0.05), used_s(0.1, 0.2, -0.05), used_s(inf, 0.2, -0.05)
+    (0.05, 0.1, 0.0)
     """
-    if mismatch_s >= 0.0 or shorter_s == inf:
+    if not mismatch_s < 0.0:  # or it is unknown
         return mismatch_s
+    if shorter_s == inf:
+        return 0.0
     return -mismatch_s * longer_s / shorter_s if shorter_s > 0.0 else inf
 
 

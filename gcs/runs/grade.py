@@ -1,7 +1,5 @@
 """Measured latencies against the truth that vehicles and emulated links recorded, for `gcs grade`.
 
-`effective_delay_s` gives the constant delay that varying delays amount to.
-
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
 acts; both are found in the truth by the time_boot_ms of the messages.
@@ -199,18 +197,3 @@ def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray
     acted_ns = [acted[system_id, key] for key in ticks["key_ms"][own].tolist()]
     pairs = [(at, at - round(1e9 * late_s)) for at, late_s in zip(acted_ns, delays_s[own].tolist(), strict=True)]
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
-
-
-def effective_delay_s(commands: NDArray[np.int64], *, held_s: float) -> float:
-    """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
-
-    T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
-    newer state acts, T / 2 on average when all arrive (`gains.sampled.multirate`). Unlike the median of the loop
-    delays, this accounts for commands that never arrived. Where delays change fast compared with the loop's motion,
-    only the mean age matters, to first order.
-    """
-    if len(commands) < 2:
-        return 0.0
-    acted_ns, sampled_ns = commands[:, 0], commands[:-1, 1]
-    acting_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
-    return float((acting_s * (late_s + acting_s / 2.0)).sum() / acting_s.sum()) - held_s / 2.0

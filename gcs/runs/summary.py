@@ -182,6 +182,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
                 v.system_id,
                 judged.errors.get(v.system_id),
                 jumps_s=jumps[v.system_id],
+                completed=judged.reason.startswith("completed"),
             )
             for v in scenario.vehicles
         ),
@@ -249,13 +250,17 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Ma
 
 
 def _vehicle(
-    rows: TickArray, own: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
+    rows: TickArray, own: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float], completed: bool
 ) -> VehicleSummary:
-    """The figures of a vehicle from all its rows, and its own of the flight."""
+    """The figures of a vehicle from all its rows, and its own of the flight.
+
+    What becomes of it after a flight that was not `completed` counts for its mode.
+    """
     sent = chosen(own, own["commanded"])
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
-    margins_s, rtt, modes = sent["delay_margin_s"], estimate(rows["rtt_s"]), rows["mode"]
+    margins_s, rtt = sent["delay_margin_s"], estimate(rows["rtt_s"])
+    modes = (own if completed else rows)["mode"]
     if (modes != Mode.WAITING).any():  # every vehicle is WAITING again once it is told to hold at the end
         modes = modes[modes != Mode.WAITING]
     return VehicleSummary(

@@ -41,12 +41,13 @@ from pathlib import Path
 import numpy as np
 
 from gains.core.arrays import FloatArray, IntArray
+from gains.sampled.multirate import effective_delay_s
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray, chosen
 from gcs.drive.flown import Flight, fly_plan, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import is_modelled
-from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
+from gcs.runs.grade import commands_of, commands_on_board
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from scenarios.keys.autopilot import Sitl

@@ -62,8 +62,8 @@ class Outcome:
 
     `verdict` is that of the whole flight for an own trial, and the sign of the growth rate for a probe. `probed` is the
     first vehicle of the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as
-    long for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
-    (`gcs.runs.grade.effective_delay_s`; on constant links all are equal); for an own trial it is the measured median.
+    long for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see
+    `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.
     `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
     models' growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a
     rough figure. `ticks_sha256` is the hash of the tick log in virtual time; the same trial has the same one in any

@@ -1,6 +1,7 @@
 """What the terminal shows before and after a flight: the design and the summary."""
 
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 
 from rich.console import Console
@@ -274,11 +275,12 @@ def print_flight(summary: Summary, console: Console) -> None:
 
 def _modes_text(summary: Summary) -> str:
     """How long vehicles were where the station had to act, or could not."""
-    left_s = {vehicle.system_id: summary.duration_s or 0.0 for vehicle in summary.vehicles}
-    in_mode_s = {mode: dict.fromkeys(left_s, 0.0) for mode in (Mode.FAILSAFE, Mode.LOST, Mode.CRITICAL)}
+    end_s = summary.duration_s or 0.0
+    until_s = {vehicle.system_id: end_s for vehicle in summary.vehicles}
+    in_mode_s = {mode: dict.fromkeys(until_s, 0.0) for mode in (Mode.FAILSAFE, Mode.LOST, Mode.CRITICAL)}
     for change in reversed(summary.mode_changes):
-        if change.system_id is not None:
-            for_s, left_s[change.system_id] = left_s[change.system_id] - change.time_s, change.time_s
+        if change.system_id is not None and change.time_s < end_s:
+            for_s, until_s[change.system_id] = until_s[change.system_id] - change.time_s, change.time_s
             mode = Mode[change.text.rpartition(" ")[2]]
             if mode in in_mode_s:
                 in_mode_s[mode][change.system_id] += for_s
@@ -317,10 +319,16 @@ def delay_text(summary: Summary) -> str:
     margin = "no limit" if margin_s is None else f"margin {ms_text(margin_s)}"
     if summary.margin_unknown:
         margin = f"margin unknown: {summary.margin_unknown}"
-    slowest_s = max((vehicle.delay_margin_s.max or 0.0 for vehicle in summary.vehicles), default=0.0)
-    if margin_s is not None and slowest_s > margin_s:
+    ranges = [vehicle.delay_margin_s for vehicle in summary.vehicles]
+    least_s, most_s = (
+        min((own.min or inf for own in ranges), default=inf),
+        max((own.max or 0.0 for own in ranges), default=0.0),
+    )
+    if margin_s is not None and all(own.min == own.max for own in ranges) and least_s < most_s:
+        margin = f"margin {ms_text(least_s, unit='')} to {ms_text(most_s)} by vehicle"
+    elif margin_s is not None and most_s > margin_s:
         way = "slower gains" if summary.prediction == "off" else "prediction"
-        margin += f", up to {ms_text(slowest_s)} with {way}"
+        margin += f", up to {ms_text(most_s)} with {way}"
     bound_s, closest = summary.loop_delay_bound_s, summary.closest_to_margin
     over = " over all vehicles" if len(summary.vehicles) > 1 else ""
     error = "" if bound_s is None else f" (clocks: ± {ms_text(bound_s)})"

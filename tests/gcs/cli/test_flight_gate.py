@@ -87,3 +87,15 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
     failed, refused = capfd.readouterr().err.splitlines()
     assert failed == "failed: --assert-headroom: read 80.1%, wanted at least 82%"
     assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"
+
+
+def test_a_check_is_no_gate_for_autopilots_that_are_not_identified(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Their margin is 600 ms if they respond at once, 445 ms as they do."""
+    monkeypatch.setattr("sys.argv", ["gcs", "check", "copters5", "--link-delay", "0.23", "--assert-headroom", "0.1"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capfd.readouterr()
+    assert (ended.value.code, out, err.count("\n")) == (2, "", 1)
+    assert "read autopilots that are identified in flight, wanted a [response] in the scenario" in err

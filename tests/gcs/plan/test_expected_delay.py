@@ -5,10 +5,12 @@ import pytest
 
 from gcs import fly_virtual
 from gcs.drive.check import check
-from gcs.plan.expected_delay import expected_loop_delay_s, planned_loop_delays_s
+from gcs.drive.flown import fly_plan
+from gcs.plan.expected_delay import effective_loop_delays_s, expected_loop_delay_s, planned_loop_delays_s
 from gcs.plan.planner import flight_plan
+from gcs.stress.free_response import effective_delays_s
 from scenarios.files import load, with_loop, with_profile
-from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
+from scenarios.keys.link import Jitter, Link, Links, LossBursts, VehicleLinks
 from scenarios.keys.part import Prediction
 from scenarios.schema import Scenario
 from scenarios.shipped import FOLDER
@@ -42,7 +44,7 @@ def test_expected_and_late_loop_delay_are_those_of_flights(scenario: Scenario) -
     assert check(flight_plan(scenario)[1]).loop_delay_s_p99 == pytest.approx(latest_s, rel=0.1)
 
 
-@pytest.mark.parametrize("prediction", ["off", "measured", 0.2])
+@pytest.mark.parametrize("prediction", ["off", "measured"])
 @pytest.mark.parametrize("name", ["chain3", "thesis_delay"], ids=["on the ground", "on board"])
 def test_late_headroom_is_that_of_flights(name: str, prediction: Prediction) -> None:
     scenario = load(FOLDER / f"{name}.toml").with_calm_monitor()
@@ -75,3 +77,58 @@ def test_on_board_the_slowest_state_that_a_command_needs_counts(name: str, expec
     assert list(planned_loop_delays_s(flight_plan(scenario)[1]).values()) == pytest.approx(expected_s)
     flown_s = [own.loop_delay_s.p50 for own in fly_virtual(scenario).summary.vehicles]
     assert flown_s == pytest.approx(expected_s, abs=0.01)  # half of a period, as phases happen to be
+
+
+def test_on_board_states_that_are_not_of_one_instant_are_waited_for() -> None:
+    """With slow telemetry the phases at which vehicles report decide, which differ from flight to flight."""
+    scenario = load(FOLDER / "thesis_delay.toml").with_calm_monitor()
+    slow = scenario.model_copy(
+        update={"rates": scenario.rates.model_copy(update={"telemetry_hz": 5.0}), "duration_s": 10.0}
+    )
+    flights = [fly_virtual(slow.model_copy(update={"seed": seed})).summary.vehicles for seed in range(1, 5)]
+    flown_s = np.mean([[own.loop_delay_s.p50 for own in flight] for flight in flights], axis=0)
+    expected_s = [*planned_loop_delays_s(flight_plan(slow)[1]).values()]
+    assert expected_s == pytest.approx(flown_s.tolist(), rel=0.1)
+    assert expected_s[1] > expected_s[0] + 0.04  # the vehicle in the middle needs both others
+
+
+@pytest.mark.parametrize("telemetry_hz", [50.0, 10.0])
+def test_where_datagrams_are_lost_older_commands_act_on(telemetry_hz: float) -> None:
+    calm = calm_chain()
+    link = Link(delay_s=0.03, loss_probability=0.3)
+    rates = calm.rates.model_copy(update={"telemetry_hz": telemetry_hz})
+    scenario = calm.model_copy(update={"links": Links(up=link, down=link), "rates": rates, "duration_s": 60.0})
+    plan = flight_plan(scenario)[1]
+    flight = fly_plan(plan, with_truth=True)
+    rows = flight.ticks[(flight.ticks["time_s"] > 2.0) & (flight.ticks["time_s"] < 58.0)]
+    flown_s = effective_delays_s(plan, rows, flight, plan.formation.system_ids)
+    [expected_s] = set(effective_loop_delays_s(plan).values())
+    # half of a period, as phases happen to be; one vehicle is in failsafe now and then
+    assert expected_s == pytest.approx(np.median([*flown_s.values()]), abs=0.01)
+    assert expected_s > 1.04 * expected_loop_delay_s(scenario)
+    assert check(plan).vehicles[1].link_delay_left_s == pytest.approx(plan.delay_margin_s - expected_s)
+
+
+def test_states_lost_in_bursts_are_late_ones() -> None:
+    """Lost one by one, they would be 0.14 s late at most for 99 % of the set-points."""
+    bursts = LossBursts(to_bad_probability=0.02, to_good_probability=0.2)
+    link = Link(delay_s=0.05, loss_bursts=bursts)
+    scenario = calm_chain().model_copy(update={"links": Links(up=link, down=link), "duration_s": 120.0})
+    flown = fly_virtual(scenario).summary
+    late_s = np.mean([own.loop_delay_s.p99 for own in flown.vehicles])
+    expected_s = check(flight_plan(scenario)[1]).loop_delay_s_p99
+    assert expected_s == pytest.approx(late_s, rel=0.15)
+    assert expected_s > 0.2
+
+
+def test_a_given_delay_is_off_by_the_wait_for_the_tick() -> None:
+    """Nobody knows it before a flight, in which it is the same throughout."""
+    calm = calm_chain()
+    rates = calm.rates.model_copy(update={"telemetry_hz": 10.0, "control_hz": 10.0})
+    control = calm.control.model_copy(update={"prediction": 1.0, "delay_margin_s": 0.4})
+    scenario = calm.model_copy(update={"rates": rates, "control": control}).with_link_delay(up_s=0.45, down_s=0.45)
+    found = check(flight_plan(scenario)[1])
+    flights = [fly_virtual(scenario.model_copy(update={"seed": seed})).summary for seed in range(1, 5)]
+    least = [own.headroom_min or 0.0 for flight in flights for own in flight.vehicles]
+    assert min(least) == pytest.approx(found.headroom_p99, abs=0.05)
+    assert (found.headroom_p99 or 0.0) < (found.headroom or 0.0) - 0.2

@@ -80,7 +80,7 @@ def test_the_table_has_the_exact_windows_or_somewhat_narrower_ones(gain_set: int
 def test_a_window_that_begins_at_no_delay_ends_at_none() -> None:
     tolerated = planned("measured").tolerance(0.1)
     assert tolerated.shorter_s[0] == inf
-    assert tolerated.used_s(0, -0.05) == -0.05
+    assert tolerated.used_s(0, -0.05) == 0.0
 
 
 def test_too_short_and_too_long_delays_use_the_same_share() -> None:

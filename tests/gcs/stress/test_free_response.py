@@ -10,9 +10,10 @@ from scipy.linalg import expm
 
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import CoupledBlock
+from gains.sampled.multirate import effective_delay_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import plan_loops
-from gcs.runs.grade import ACTED, SAMPLED, commands_of, effective_delay_s, instants
+from gcs.runs.grade import ACTED, SAMPLED, commands_of, instants
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, in_place, response_paired
 from gcs.stress.growth import CHANNELS

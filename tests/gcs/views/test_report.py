@@ -18,6 +18,14 @@ def test_a_flight_that_settled_says_how_long_vehicles_were_out_of_hand() -> None
     assert in_failsafe == "vehicle 3 FAILSAFE for 0.04 s"
     assert lost == "vehicle 3 LOST for 2.52 s"
     assert critical.startswith("vehicle 3 CRITICAL for 0.")
+    assert {own.mode_final for own in summary.vehicles} == {"NOMINAL"}
+
+
+def test_margins_of_single_vehicles_are_not_taken_for_those_of_slower_gains() -> None:
+    quick, slow = Link(delay_s=0.02), Link(delay_s=0.09)
+    links = Links(up=quick, down=quick, vehicles=(VehicleLinks(system_id=3, up=slow, down=slow),))
+    scenario = load(located("chain3_bidirectional")).model_copy(update={"links": links, "duration_s": 5.0})
+    assert "; margin 390.0 to 503.7 ms by vehicle; " in flight_lines(fly_virtual(scenario).summary)["delay"]
 
 
 def test_a_flight_in_hand_throughout_says_nothing_of_modes() -> None:
