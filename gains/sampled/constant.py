@@ -71,7 +71,10 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
 
 
 def forget_margins() -> None:
-    """Compute the sampled margins of loops anew that were asked for before, as what measures times wants."""
+    """Compute the sampled margins of loops anew that were asked for before, as what measures times wants.
+
+    >>> forget_margins()
+    """
     block_delay_margin.cache_clear()
 
 
