@@ -24,6 +24,7 @@ from gcs.drive.guard import Guard
 from gcs.drive.lockstep import EPOCH_NS, START_NS
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
@@ -250,7 +251,7 @@ def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version:
             for frame in mavlink.decode_either(data, watch.counters):
                 watch.take(frame, now_ns, ("127.0.0.1", 9 + step % 3, 0))
         watch.look(now_ns)
-    for figures in watch.figures(now_ns, 0.3):
+    for figures in watch.figures(now_ns, Design(delay_margin_s=0.3)):
         figures.to_json()
     assert watch.counters["bad checksum"] > 0
     assert watch.counters["truncated"] > 0
