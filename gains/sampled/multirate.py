@@ -294,9 +294,9 @@ def effective_delay_s(commands: IntArray, *, held_s: float) -> float:
     """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
 
     T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
-    newer state acts, T / 2 on average when all arrive. Unlike the median of the loop
-    delays, this accounts for commands that never arrived. Where delays change fast compared with the loop's motion,
-    only the mean age matters, to first order.
+    newer state acts, T / 2 on average when all arrive. Unlike the median of the loop delays, this accounts for commands
+    that never arrived. Where delays change fast compared with the loop's motion, only the mean age matters, to first
+    order.
 
     Parameters
     ----------

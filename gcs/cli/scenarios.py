@@ -1,6 +1,7 @@
 """`gcs scenarios`, `new`, `check`, `design` and `margin`: from a scenario to its gains and the delay they tolerate."""
 
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -168,7 +169,7 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         console.print(
             "         if the vehicles responded at once: how autopilots respond is known once they are identified"
         )
-    if found.effective_loop_delay_s > _LONGER * found.expected_loop_delay_s:
+    if (found.effective_loop_delay_s or inf) > _LONGER * found.expected_loop_delay_s:
         past = "" if (found.effective_headroom or 0.0) > 0.0 else ": unstable"
         effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
         console.print(f"         where datagrams are lost, older commands act on: as a loop delay of {effective}{past}")

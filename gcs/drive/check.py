@@ -77,9 +77,9 @@ class ScenarioCheck(Published):
     """A scenario before its flight."""
 
     expected_loop_delay_s: float
-    effective_loop_delay_s: float
+    effective_loop_delay_s: float | None
     """The constant loop delay that decides about stability: with links that lose datagrams it is longer, because older
-    commands act on. Of the vehicle that it leaves least headroom."""
+    commands act on. Of the vehicle that it leaves least headroom; None if next to nothing arrives."""
     effective_headroom: float | None
     """The headroom at that delay."""
     channels_not_included: bool
@@ -163,7 +163,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
-        effective_loop_delay_s=effective_s[critical],
+        effective_loop_delay_s=_known(effective_s[critical]),
         effective_headroom=_known(left[critical]),
         channels_not_included=waits_for_channels(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,

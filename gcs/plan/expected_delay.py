@@ -128,12 +128,14 @@ def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays
 def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     """The constant loop delays (s) that those of a plan's vehicles amount to.
 
-    They are the expected ones but for links to the ground that lose datagrams: where no newer command arrives, the one
-    before it acts on (`gains.sampled.multirate.effective_delay_s`).
+    They are the expected ones but for loops on the ground over links that lose datagrams: where no newer command
+    arrives, the one before it acts on (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to
+    nothing arrives. A prediction knows the age of each state, whatever was lost.
     """
     scenario, delays_s = plan.scenario, planned_loop_delays_s(plan)
     links = {own: scenario.link_of(own) for own in delays_s}
-    if scenario.control.loop == "onboard" or not any(_loses(link) for way in links.values() for link in way):
+    is_late = scenario.control.loop == "ground" and scenario.control.prediction == "off"
+    if not is_late or not any(_loses(link) for way in links.values() for link in way):
         return delays_s
     rng, held_s = np.random.default_rng(0), plan.timing.held_s
     found = {way: _effective_s(scenario, *way, held_s, rng) for way in dict.fromkeys(links.values())}
@@ -144,11 +146,13 @@ def _effective_s(scenario: Scenario, up: Link, down: Link, held_s: float, rng: n
     heard, period_s = _heard_over(scenario, up, rng), 1.0 / scenario.rates.control_hz
     enters, out, main = _stream(down, scenario.rates.control_hz, scenario, rng)
     late_s = (out - enters)[main > 0.0]
-    if not len(heard.arrived_s) or not np.isfinite(late_s).any():
+    if not len(heard.arrived_s):
         return inf
     at_all_phases_s = period_s + held_s / len(late_s)
     ticks = heard.arrived_s[0] + np.arange(len(late_s)) * at_all_phases_s
     kept = np.isfinite(late_s) & (ticks < heard.newest_s[-1])
+    if kept.sum() < 2:
+        return inf
     ticks, late_s = ticks[kept], late_s[kept]
     sampled_s = heard.newest_s[np.searchsorted(heard.arrived_s, ticks, side="right") - 1]
     commands = np.rint(NS_PER_S * np.column_stack([ticks + late_s, sampled_s])).astype(np.int64)
@@ -223,7 +227,8 @@ def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -
     if not all(len(own.arrived_s) for own in every):
         return np.full(_MOST // 2, max(up.delay_max_s for up in ups))
     if len(every) > 1:
-        return _oldest_s(scenario, every, rng)
+        ages = _oldest_s(scenario, every, rng)
+        return ages if len(ages) else np.full(_MOST // 2, max(up.delay_max_s for up in ups))
     [heard] = every
     ticks = rng.uniform(0.0, heard.newest_s[-1], _MOST // 2)
     place = np.searchsorted(heard.arrived_s, ticks, side="right") - 1
@@ -238,10 +243,11 @@ def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Genera
     """Ages (s) of the oldest of the newest states of several vehicles, less how long it was repeated.
 
     Whose state is the oldest changes within a period of slower telemetry, with the phases of the vehicles, which are
-    drawn anew `_PHASES` times.
+    drawn anew `_PHASES` times. Empty if next to nothing arrives.
     """
     period_s, longest = 1.0 / scenario.rates.control_hz, _longest_repetition(scenario)
-    count = min(_MOST // 2 // _PHASES, int(0.25 * min(own.newest_s[-1] for own in every) / period_s))
+    room_s = min(float(own.newest_s[-1] - own.arrived_s[0]) for own in every)
+    count = max(0, min(max(_MOST // 2 // _PHASES, 4 * longest), int(0.5 * room_s / period_s)))
     k, found = np.arange(count), list[FloatArray]()
     for _ in range(_PHASES):
         ages_s = np.zeros(count)
