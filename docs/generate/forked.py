@@ -1,4 +1,4 @@
-"""The `gcs` command in processes forked from one that has loaded the project: a command starts 2 s sooner."""
+"""The `gcs` command in processes forked from one that has loaded the project, which saves each a second or two."""
 
 import contextlib
 import os

@@ -43,7 +43,7 @@ _ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 def block_delay_margin(plant: SampledPlant) -> float:
     """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
 
-    Of the same plant it is computed once: designs, margins over links and loops of single vehicles all ask for it.
+    It is computed once for each plant: designs, margins over links and loops of single vehicles all ask for it.
 
     DisagreementError if the eigenvalues of the one-period map contradict the crossings found.
     """

@@ -20,7 +20,7 @@ _ROUNDING, _MOST = 1e-15, 1e30
 
 
 class ByContent:
-    """A dataclass of arrays and other values that equals another with the same bits, so that results are kept by it."""
+    """A dataclass of arrays and other values; two with the same bits are equal, and have the same results."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and self._content == other._content

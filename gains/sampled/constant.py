@@ -71,7 +71,7 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
 
 
 def forget_margins() -> None:
-    """Compute the sampled margins of loops anew that were asked for before, as what measures times wants.
+    """Forget the sampled margins computed so far, so that a measured time includes their computation.
 
     >>> forget_margins()
     """

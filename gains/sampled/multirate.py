@@ -291,21 +291,16 @@ def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) 
 
 
 def effective_delay_s(commands: IntArray, *, held_s: float) -> float:
-    """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
+    """The constant loop delay (s) equivalent to commands: the mean age of the state behind them, less T / 2.
 
+    `commands` (k, 2) has the instants in ns at which each acted and at which the state behind it was sampled, in order.
     T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
     newer state acts, T / 2 on average when all arrive. Unlike the median of the loop delays, this accounts for commands
     that never arrived. Where delays change fast compared with the loop's motion, only the mean age matters, to first
     order.
 
-    Parameters
-    ----------
-    commands
-        (k, 2) in ns and in order: when each acted, and when the state behind it was sampled.
+    Every 20 ms a command from a state of 0.1 s before acts; then one command is lost:
 
-    Every 20 ms a state acts that is 0.1 s old; then one command is lost:
-
-    >>> import numpy as np
     >>> acted_ns = np.array([0, 20, 40, 60, 100]) * 1_000_000
     >>> commands = np.column_stack([acted_ns, acted_ns - 100_000_000])
     >>> [round(effective_delay_s(some, held_s=0.02), 6) for some in (commands[:4], commands)]

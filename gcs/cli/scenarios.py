@@ -172,7 +172,9 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     if (found.effective_loop_delay_s or inf) > _LONGER * found.expected_loop_delay_s:
         past = "" if (found.effective_headroom or 0.0) > 0.0 else ": unstable"
         effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
-        console.print(f"         where datagrams are lost, older commands act on: as a loop delay of {effective}{past}")
+        console.print(
+            f"         lost datagrams, after which older commands act on, make it as long as {effective}{past}"
+        )
     late = f"loop at most {ms_text(found.loop_delay_s_p99)}, headroom at least {number_text(found.headroom_p99, '.0%')}"
     console.print(f"         for 99 % of the set-points: {late}")
     if found.channels_not_included:

@@ -91,7 +91,7 @@ TICK = np.dtype(
         ("down_delay_s", "<f8"),  # newest one-way delay to the vehicle, and the time it holds set-points; or NaN
         ("down_bound_s", "<f8"),  # largest error of down_delay_s
         ("loop_delay_s", "<f8"),  # age of the state used + down_delay_s - repeated_s; onboard: of the oldest one used
-        ("loop_delay_bound_s", "<f8"),  # largest error that clocks bring into it; onboard: at most
+        ("loop_delay_bound_s", "<f8"),  # largest error that clocks bring into it
         ("repeated_s", "<f8"),  # how long set-points have repeated one state because telemetry is slower
         ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
         ("delay_margin_s", "<f8"),  # longest delay that the gains flown tolerate, as known then; infinite: any

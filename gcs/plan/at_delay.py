@@ -26,7 +26,9 @@ def with_figures_at_delay(design: Design, plan: FlightPlan) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
     scenario = plan.scenario
     delays_s = planned_loop_delays_s(plan).values()
-    figures = figures_at(design, scenario, max(delays_s)).model_dump() | {"links_differ": min(delays_s) < max(delays_s)}
+    figures = figures_at(design, scenario, max(delays_s)).model_dump() | {
+        "delays_differ": min(delays_s) < max(delays_s)
+    }
     if figures["alpha"] is None:
         return design
     if not _is_predicted(design):

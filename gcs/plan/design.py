@@ -158,8 +158,8 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     """None where α is kept at every loop delay; the same below."""
     string_peak_kept: float | None = None
     string_peak_kept_to_s: float | None = None
-    links_differ: bool = False
-    """Whether only the slowest link gives this loop delay, which the figures are of if all vehicles have it."""
+    delays_differ: bool = False
+    """Whether only the slowest vehicle has this loop delay; the figures are those if all have it."""
 
 
 class VehicleSpread(Published):
@@ -286,7 +286,8 @@ class Design(Published):
     delay_margin_s: Margin
     delay_margin_continuous_s: Margin = None
     margin_over_links: bool = False
-    """Whether the sampled margin is that over the scenario's links, which differ; the continuous one never is."""
+    """Whether the sampled margin is that over the scenario's links, as vehicles share a loop and their loop delays
+    differ; the continuous one never is."""
     own_margins: tuple[OwnMargins, ...] = ()
     """Of the vehicles that are not judged by the margins of the schedule."""
     period_s: float = 0.0

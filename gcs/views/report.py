@@ -115,7 +115,7 @@ def _print_margins(design: Design, console: Console) -> None:
     elif sampled_s == 0.0:
         console.print("margin   none: the sampled loop is unstable without any delay")
     else:
-        over, alike = (" over the scenario's links", " if they were alike") if design.margin_over_links else ("", "")
+        over, alike = (" over the scenario's links", " if delays were alike") if design.margin_over_links else ("", "")
         console.print(
             f"margin   {ms_text(sampled_s)} of loop delay in the sampled loop{over}, {ms_text(continuous_s)} in the "
             f"continuous model{alike}"
@@ -155,8 +155,8 @@ _WINDOW_COLUMNS: dict[str, Callable[[WindowAt], str]] = {
 
 def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:
     at = "at the {} of loop delay that the scenario's links give"
-    if flown.links_differ:
-        at = "if all vehicles have the {} of loop delay that the slowest link gives"
+    if flown.delays_differ:
+        at = "if all vehicles have the {} of loop delay of the slowest"
     console.print(f"         {figures_text(flown, at)}")
     if flown.alpha_kept is None:
         return
