@@ -26,6 +26,8 @@ _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
 """Half widths of the first and the finest round of an onset search, in tolerances."""
+_LARGEST_ERROR = 0.1
+"""Standard error of an onset, as a share of the prediction, above which none was measured."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
@@ -126,7 +128,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     """Fly probes ever closer around the predicted onset, until the zero of their growth rates is located.
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
-    and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
+    and those of later rounds over a fraction of one if no smooth curve fits. Flights that scatter, as over random links,
+    are spread farther until the standard error is a quarter of their range. The search follows the measured growth;
     the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
     for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. The link
     of `vehicle` alone is slowed, or all links alike. Raises NoOnset with the reason.
@@ -149,6 +152,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         expected_s, width_s = (found[0] + found[1]) / 2.0, (found[1] - found[0]) / 2.0
         centre_s = expected_s
     flights: dict[str, Outcome] = {}
+    zero, scatters = None, False
     random_links = not has_constant_links(study.plan.scenario)
     noisy = study.real_time or random_links  # closer flights would show only noise
     for round_number in range(1, _ROUNDS + 1):
@@ -160,8 +164,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
             slowed.probe(link_s, seed=first_seed + (len(flights) + k if random_links else 0))
             for k, link_s in enumerate(links_s)
         ]
-        flown = run(trials)
-        flights |= {outcome.id: outcome for outcome in flown}
+        flights |= {outcome.id: outcome for outcome in run(trials)}
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
         grown = (
             GrowthPoint(way * o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
@@ -176,9 +179,14 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         zero = replace(zero, varied=way * zero.varied)
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.varied - waiting_s) - centre_s
+        scatters = zero.error > min(width_s / 2.0, _LARGEST_ERROR * expected_s)
+        if scatters:
+            width_s = min(2.0 * width_s, expected_s)
+            continue
         wanted_s = tolerance * expected_s
+        fine = width_s <= 1.001 * wanted_s or zero.error > wanted_s  # closer flights would show only noise
         close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
-        if zero.inside and close and width_s <= 1.001 * wanted_s:
+        if zero.inside and close and fine:
             return _found(slowed, run, zero, near, tuple(flights.values()), rounds=round_number, shorter=shorter)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
@@ -188,10 +196,13 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
     failed = sum(outcome.growth_1_s is None for outcome in flights.values())
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights.values()]
-    raise NoOnset(
-        f"growth did not pass zero in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link "
-        f"delay ({failed} without a growth rate)"
-    )
+    flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
+    if zero is not None and scatters:
+        raise NoOnset(
+            f"growth rates scatter too much {flown}: they pass zero at {zero.varied:.3f} s ± {zero.error:.3f} s of loop "
+            "delay"
+        )
+    raise NoOnset(f"growth did not pass zero {flown} ({failed} without a growth rate)")
 
 
 @dataclass(frozen=True)
