@@ -128,9 +128,9 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     """Fly probes ever closer around the predicted onset, until the zero of their growth rates is located.
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
-    and those of later rounds over a fraction of one if no smooth curve fits. Flights that scatter, as over random links,
-    are spread farther until the standard error is a quarter of their range. The search follows the measured growth;
-    the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
+    and those of later rounds over a fraction of one if no smooth curve fits. Flights that scatter, as over random
+    links, are spread farther until the standard error is a quarter of their range. The search follows the measured
+    growth; the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
     for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. The link
     of `vehicle` alone is slowed, or all links alike. Raises NoOnset with the reason.
     """
@@ -194,15 +194,18 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         centre_s += float(np.clip(ahead_s, -2.0 * width_s, 2.0 * width_s))
         if abs(ahead_s) < width_s:
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
-    failed = sum(outcome.growth_1_s is None for outcome in flights.values())
-    flown_s = [outcome.link_delay_s or 0.0 for outcome in flights.values()]
+    raise _not_located(list(flights.values()), zero if scatters else None)
+
+
+def _not_located(flights: Sequence[Outcome], scattered: Zero | None) -> NoOnset:
+    """Why these flights tell no onset."""
+    flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
     flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
-    if zero is not None and scatters:
-        raise NoOnset(
-            f"growth rates scatter too much {flown}: they pass zero at {zero.varied:.3f} s ± {zero.error:.3f} s of loop "
-            "delay"
-        )
-    raise NoOnset(f"growth did not pass zero {flown} ({failed} without a growth rate)")
+    if scattered is not None:
+        at = f"{scattered.varied:.3f} s ± {scattered.error:.3f} s of loop delay"
+        return NoOnset(f"growth rates scatter too much {flown}: they pass zero at {at}")
+    failed = sum(outcome.growth_1_s is None for outcome in flights)
+    return NoOnset(f"growth did not pass zero {flown} ({failed} without a growth rate)")
 
 
 @dataclass(frozen=True)
