@@ -15,9 +15,11 @@ from scenarios.networks import MOST_VEHICLES
 
 _LONGER = 1.01
 """How many times the expected loop delay an effective one is that is worth a line."""
+_RARE = 0.01
+"""Expected number of failsafes in a flight that is not worth a line."""
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from gcs.drive.check import CourseCheck, PlannedMotionCheck, ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
@@ -115,7 +117,8 @@ def check(
 ) -> None:
     """Check a scenario before a flight: its keys, design and start.
 
-    Exit code 2 if `gcs fly` would refuse it. --assert-headroom means the headroom that 99 % of the set-points keep.
+    Exit code 2 if `gcs fly` would refuse it. --assert-headroom means the headroom that 99 % of the set-points keep, and
+    that of the constant loop delay which late and lost datagrams amount to.
     """
     from gcs.drive import preflight
     from gcs.drive.check import check as checked
@@ -136,7 +139,7 @@ def check(
         read, wanted = "autopilots that are identified in flight", "a [response] in the scenario, which makes it known"
         options.refuse(scenario_file, f"--assert-headroom: read {read}, wanted {wanted}", in_file=False)
     options.answer(found, partial(_print_check, design), as_json=as_json)
-    if assert_headroom is not None and (unmet := options.unmet_headroom(found.headroom_p99, assert_headroom)):
+    if assert_headroom is not None and (unmet := options.unmet_headroom(found.least_headroom, assert_headroom)):
         options.say_failed(unmet)
         raise typer.Exit(FAILED)
 
@@ -150,35 +153,8 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     for text, code in found.code.items():
         console.print(f"runs     {text}, sha256 {code.sha256}", markup=False)
     print_design(design, console)
-    margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
-    margin = "unknown" if design.margin_unknown else margin
-    if found.mismatch_window_s is not None:
-        least_s, most_s = found.mismatch_window_s
-        stable = f"stable from {ms_text(least_s, unit='')} to {ms_text(most_s)}"
-        margin = f"predicted over {ms_text(found.assumed_delay_s)}: {stable}"
-    else:
-        margin = f"margin {margin}"
-    unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
-    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
-    whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
-    console.print(
-        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links{whose}, {margin}, "
-        f"headroom {number_text(found.headroom, '.0%')}{unstable}"
-    )
-    if not found.response_known:
-        console.print(
-            "         if the vehicles responded at once: how autopilots respond is known once they are identified"
-        )
-    if (found.effective_loop_delay_s or inf) > _LONGER * found.expected_loop_delay_s:
-        past = "" if (found.effective_headroom or 0.0) > 0.0 else ": unstable"
-        effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
-        console.print(
-            f"         lost datagrams, after which older commands act on, make it as long as {effective}{past}"
-        )
-    late = f"loop at most {ms_text(found.loop_delay_s_p99)}, headroom at least {number_text(found.headroom_p99, '.0%')}"
-    console.print(f"         for 99 % of the set-points: {late}")
-    if found.channels_not_included:
-        console.print("         without the time that datagrams wait for their channel, which only a flight shows")
+    for line in _delay_lines(design, found):
+        console.print(line, markup=False)
     for key, (given, simulated) in found.response_differs.items():
         simulated_text = f"the simulated autopilots have {number_text(simulated, 'g')}"
         console.print(f"response {key} {number_text(given, 'g')}, for which the control is designed: {simulated_text}")
@@ -209,6 +185,43 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
             f"limits   vehicle{'s' * (len(beyond) > 1)} {' '.join(map(str, beyond))} cannot fly the first command: "
             "until errors are smaller, the flight differs from the linear analysis"
         )
+
+
+def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
+    """The loop delay that the links lead to, and what it leaves."""
+    from gcs.views.console import ms_text, number_text
+
+    margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
+    margin = "unknown" if design.margin_unknown else margin
+    if found.mismatch_window_s is not None:
+        least_s, most_s = found.mismatch_window_s
+        stable = f"stable from {ms_text(least_s, unit='')} to {ms_text(most_s)}"
+        margin = f"predicted over {ms_text(found.assumed_delay_s)}: {stable}"
+    else:
+        margin = f"margin {margin}"
+    unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
+    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
+    whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
+    yield (
+        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links{whose}, {margin}, "
+        f"headroom {number_text(found.headroom, '.0%')}{unstable}"
+    )
+    if not found.response_known:
+        yield "         if the vehicles responded at once: how autopilots respond is known once they are identified"
+    if (found.effective_loop_delay_s or inf) > _LONGER * found.expected_loop_delay_s:
+        is_past = found.effective_loop_delay_s is None or (found.effective_headroom or 1.0) <= 0.0
+        past = ": unstable" if is_past else ""
+        effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
+        yield f"         late and lost datagrams, after which older commands act on, make it {effective}{past}"
+    late = f"loop at most {ms_text(found.loop_delay_s_p99)}, headroom at least {number_text(found.headroom_p99, '.0%')}"
+    yield f"         for 99 % of the set-points: {late}"
+    if found.channels_not_included:
+        yield "         without the time that datagrams wait for their channel, which only a flight shows"
+    if found.outage_s is not None:
+        yield f"         without outages of links, of up to {found.outage_s:g} s"
+    if found.setpoint_gaps > _RARE:
+        often = f"{found.setpoint_gaps:.2g} times in the flight, no set-point arrives for safety.setpoint_timeout_s"
+        yield f"failsafe about {often}, after which a vehicle holds"
 
 
 def _course_text(course: "CourseCheck") -> str:

@@ -1,11 +1,13 @@
 """A scenario before its flight: places, errors and commands at the start, and the expected loop delay."""
 
 from collections.abc import Iterator
+from functools import partial
 from math import hypot, inf, isfinite
 
 import numpy as np
 from pydantic import Field
 
+from gains.core.arrays import FloatArray
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
@@ -14,6 +16,7 @@ from gcs.plan.expected_delay import (
     drawn_delays,
     effective_loop_delays_s,
     planned_loop_delays_s,
+    setpoint_gaps,
     waits_for_channels,
 )
 from gcs.plan.flight_plan import FlightPlan
@@ -25,8 +28,6 @@ from gcs.published import Published
 from scenarios.schema import Scenario
 
 _LATE = 0.99
-_WAITS = 101
-"""Waits for the tick that are looked at, from none to the longest."""
 
 
 class VehicleCheck(Published):
@@ -46,7 +47,8 @@ class VehicleCheck(Published):
     headroom: float | None
     """As that of the formation, at this vehicle's expected loop delay."""
     link_delay_left_s: float | None
-    """How much more delay its link takes, with all other links as they are. None if any, or if it is not known."""
+    """How much more delay its link takes, with all other links as they are. None if any, if it is not known, or if the
+    station predicts over the measured delay, which follows."""
 
 
 class PlannedMotionCheck(Published):
@@ -78,12 +80,17 @@ class ScenarioCheck(Published):
 
     expected_loop_delay_s: float
     effective_loop_delay_s: float | None
-    """The constant loop delay that decides about stability: with links that lose datagrams it is longer, because older
-    commands act on. Of the vehicle that it leaves least headroom; None if next to nothing arrives."""
+    """The constant loop delay that decides about stability: over links with jitter or losses it is longer, because
+    older commands act on. Of the vehicle that it leaves least headroom; None if next to nothing arrives."""
     effective_headroom: float | None
     """The headroom at that delay."""
     channels_not_included: bool
     """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
+    outage_s: float | None
+    """The longest outage of a link during the flight, which no figure here includes; None without any."""
+    setpoint_gaps: float
+    """How often in the flight, over all vehicles, no set-point is expected to arrive for `safety.setpoint_timeout_s`,
+    so that a vehicle enters failsafe; without outages."""
     delay_margin_s: float | None
     """None if no delay makes the loop unstable; with prediction the upper end of the mismatch window."""
     assumed_delay_s: float | None
@@ -95,7 +102,7 @@ class ScenarioCheck(Published):
     """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
     any margin."""
     loop_delay_s_p99: float
-    """The loop delay that 99 % of the set-points keep, over the slowest links."""
+    """The loop delay that 99 % of the set-points keep, over the slowest links, at the worst phase of the ticks."""
     headroom_p99: float | None
     """The headroom that 99 % of the set-points keep, of the vehicle that has the least; None without any margin."""
     closest_m: float | None
@@ -115,6 +122,12 @@ class ScenarioCheck(Published):
     code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
     """The code that would be run: its file by the key that names it."""
 
+    @property
+    def least_headroom(self) -> float | None:
+        """The least of `headroom_p99` and `effective_headroom`; None without any margin, or if it has no end."""
+        found = self.headroom_p99, self.effective_headroom
+        return None if None in found else min(own for own in found if own is not None)
+
 
 def check(plan: FlightPlan) -> ScenarioCheck:
     """The vehicles of a plan at the start, and the headroom that the scenario's links leave."""
@@ -131,7 +144,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
     commands = plan.gain @ errors
     limits, delays_s = scenario.limits, planned_loop_delays_s(plan)
-    left_s = link_delays_left_s(plan) if scenario.control.prediction != "measured" else {}
+    left_s = link_delays_left_s(plan) if scenario.control.prediction != "measured" else dict[int, float]()
     vehicles: list[VehicleCheck] = []
     for row, vehicle in enumerate(ordered):
         north_m, east_m = place[row].tolist()
@@ -147,8 +160,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
                 expected_loop_delay_s=delays_s[own],
-                headroom=_known(_headroom(plan, row, delays_s[own])),
-                link_delay_left_s=_known(left_s.get(own, plan.tolerance_of(row, delays_s[own]).longer_s[0])),
+                headroom=_known(_headroom(plan, row, delays_s[own], delays_s[own])),
+                link_delay_left_s=_known(left_s.get(own, inf)),
             )
         )
     delay_s = max(delays_s.values())
@@ -158,7 +171,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
     drawn, effective_s = drawn_delays(plan), effective_loop_delays_s(plan)
-    left = {own: _headroom(plan, row, effective_s[own]) for row, own in enumerate(formation.system_ids)}
+    left = {own: _headroom(plan, row, effective_s[own], delays_s[own]) for row, own in enumerate(formation.system_ids)}
     critical = min(left, key=left.__getitem__)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
@@ -166,11 +179,13 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         effective_loop_delay_s=_known(effective_s[critical]),
         effective_headroom=_known(left[critical]),
         channels_not_included=waits_for_channels(scenario),
+        outage_s=max(_outages_s(scenario), default=None),
+        setpoint_gaps=setpoint_gaps(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
         assumed_delay_s=assumed_s if is_predicted else None,
         mismatch_window_s=window_s if is_predicted and margin_s < inf else None,
         headroom=min((left for own in vehicles if (left := own.headroom) is not None), default=None),
-        loop_delay_s_p99=max(float(np.quantile(own.loop_s, _LATE)) for own in drawn.values()),
+        loop_delay_s_p99=max(float(np.quantile(own.loop_s, _LATE, axis=1).max()) for own in drawn.values()),
         headroom_p99=_late_headroom(plan, drawn),
         closest_m=None if nearest is None else nearest.distance_m,
         closest_s=None if nearest is None else nearest.time_s,
@@ -188,9 +203,12 @@ def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
     return delay_s if plan.scenario.control.prediction == "measured" else plan.assumed_s or 0.0
 
 
-def _headroom(plan: FlightPlan, row: int, delay_s: float) -> float:
-    """What a loop delay leaves of a vehicle's margin; with prediction of the distance to the window's end."""
-    assumed_s = _assumed_s(plan, delay_s)
+def _headroom(plan: FlightPlan, row: int, delay_s: float, expected_s: float) -> float:
+    """What a loop delay leaves of a vehicle's margin; with prediction of the distance to the window's end.
+
+    A prediction over the measured delay assumes the expected one.
+    """
+    assumed_s = _assumed_s(plan, expected_s)
     tolerated = plan.tolerance_of(row, assumed_s)
     return headroom(tolerated.used_s(0, delay_s - assumed_s), tolerated.longer_s[0])
 
@@ -204,18 +222,31 @@ def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | N
     """
     prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
     rates = plan.scenario.rates
-    waits_s = np.linspace(-0.5, 0.5, _WAITS) / max(rates.telemetry_hz, rates.control_hz)
+    wait_s = 0.5 / max(rates.telemetry_hz, rates.control_hz)
     for row, system_id in enumerate(plan.formation.system_ids):
         own = drawn[system_id]
         assumed_s = _assumed_s(plan, float(own.loop_s.mean()))
         tolerated = plan.tolerance_of(row, assumed_s)
         if (kind := (id(own), tolerated)) not in late:
             mismatch_s = own.loop_s if prediction == "off" else own.down_s + own.ages_s.mean() - assumed_s
-            if prediction not in {"measured", "off"}:
-                mismatch_s += np.resize(waits_s, len(mismatch_s))
-            used_s = [tolerated.used_s(0, each_s) for each_s in mismatch_s.tolist()]
-            late[kind] = headroom(float(np.quantile(used_s, _LATE)), tolerated.longer_s[0])
+            waits_s = (-wait_s, wait_s) if prediction not in {"measured", "off"} else (0.0,)
+            late[kind] = min(_kept(mismatch_s + each_s, tolerated) for each_s in waits_s)
     return _known(min(late.values()))
+
+
+def _kept(mismatch_s: FloatArray, tolerated: Tolerated) -> float:
+    """The headroom that most of these mismatches (phases, k) keep, at the worst phase."""
+    used_s = np.vectorize(partial(tolerated.used_s, 0), [float])(mismatch_s)
+    return headroom(float(np.quantile(used_s, _LATE, axis=1, method="higher").max()), tolerated.longer_s[0])
+
+
+def _outages_s(scenario: Scenario) -> Iterator[float]:
+    """The outages of all links, as long as they last during the flight."""
+    for vehicle in scenario.vehicles:
+        for link in scenario.link_of(vehicle.system_id):
+            for outage in link.outages:
+                if outage.from_s < scenario.duration_s:
+                    yield min(outage.until_s, scenario.duration_s) - outage.from_s
 
 
 def _known(value: float) -> float | None:

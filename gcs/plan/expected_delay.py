@@ -4,7 +4,8 @@ On links that only delay it is a sum. Jitter needs more than its mean: no delay 
 overtake waits for the one before it, and a state that arrives after a newer one is not used. Datagrams are therefore
 drawn as the links would carry them, with a seed of their own, and the median is taken, which flights report as p50 of
 the slowest vehicle. Where datagrams may overtake each other and jitter is as large as the delay, flights were up to 8 %
-faster than this. The median says nothing of lost datagrams; what they amount to is `effective_loop_delays_s`.
+faster than this. The median says nothing of datagrams that are lost or very late; what they amount to is
+`effective_loop_delays_s`.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -23,12 +24,12 @@ from scenarios.keys.link import Link
 from scenarios.keys.part import HELD_SHARE
 from scenarios.schema import NS_PER_S, Scenario
 
-_SECONDS = 200.0
-"""Time over which datagrams are drawn: at 50 Hz the median then has a standard error of about 1 % of the spread."""
+_SECONDS = 1000.0
+"""Longest time over which datagrams are drawn."""
 _MOST = 20_000
 """Most datagrams drawn in one direction."""
-_PHASES = 25
-"""Draws of the phases at which several vehicles report."""
+_PHASES, _DRAWS = 25, 200
+"""Phases of the ticks that are looked at; draws of the phases at which several vehicles report."""
 _SAME_S, _NEVER = 1e-9, 1e-12
 """Instants (s) closer than this are one, and a probability this small stands for none."""
 _Way = tuple[tuple[Link, ...], Link]
@@ -36,7 +37,10 @@ _Way = tuple[tuple[Link, ...], Link]
 
 
 class DrawnDelays(NamedTuple):
-    """Delays at random ticks, each (k,): the ages of states (s) and the one-way delays of set-points (s)."""
+    """Delays at random ticks: the ages of states (s) and the one-way delays of set-points (s).
+
+    Each is (phases, k): in a flight, the phase of the ticks to the telemetry stays about the same.
+    """
 
     ages_s: FloatArray
     down_s: FloatArray
@@ -79,7 +83,8 @@ def expected_loop_delays_s(
 
     On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
     first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams. Where `heard` names others for a vehicle,
+    happen to be. With jitter or losses it is the median over drawn datagrams, averaged
+    over the phases. Where `heard` names others for a vehicle,
     it counts from the oldest of their states in place of its own. The time that datagrams wait for a channel is not
     included (`waits_for_channels`).
     """
@@ -87,8 +92,10 @@ def expected_loop_delays_s(
     unlike = dict.fromkeys(ways.values())
     rates = scenario.rates
     in_turn = rates.telemetry_hz < rates.control_hz and any(len(ups) > 1 for ups, _ in unlike)
-    if in_turn or any(link.jitter or _loses(link) for ups, down in unlike for link in (*ups, down)):
-        around_s = {way: float(np.median(drawn.loop_s)) for way, drawn in _drawn(scenario, unlike).items()}
+    if in_turn or any(_is_random(link) for ups, down in unlike for link in (*ups, down)):
+        around_s = {
+            way: float(np.median(drawn.loop_s, axis=1).mean()) for way, drawn in _drawn(scenario, unlike).items()
+        }
     else:
         waiting_s = 0.5 / max(rates.telemetry_hz, rates.control_hz)
         around_s = {
@@ -98,7 +105,7 @@ def expected_loop_delays_s(
 
 
 def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
-    """Delays drawn over the links of each of a plan's vehicles, of which `planned_loop_delays_s` are the medians."""
+    """Delays drawn over the links of each of a plan's vehicles, whose medians `planned_loop_delays_s` are."""
     ways = _ways(plan.scenario, _heard(plan))
     drawn = _drawn(plan.scenario, dict.fromkeys(ways.values()))
     return {own: drawn[way] for own, way in ways.items()}
@@ -107,7 +114,7 @@ def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
     """Loop delays (s) drawn over one vehicle's links, at random ticks (k,), as `expected_loop_delay_s` draws them."""
     way = (up,), down
-    return _drawn(scenario, [way])[way].loop_s
+    return _drawn(scenario, [way])[way].loop_s.ravel()
 
 
 def _ways(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int, _Way]:
@@ -121,45 +128,78 @@ def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays
     rng = np.random.default_rng(0)
     ages_s = {ups: _ages_s(scenario, ups, rng) for ups in dict.fromkeys(ups for ups, _ in ways)}
     late_s = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in ways)}
-    return {(ups, down): DrawnDelays(ages_s[ups], rng.choice(late_s[down], len(ages_s[ups]))) for ups, down in ways}
+    return {(ups, down): DrawnDelays(ages_s[ups], rng.choice(late_s[down], ages_s[ups].shape)) for ups, down in ways}
 
 
 def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     """The constant loop delays (s) that those of a plan's vehicles amount to.
 
-    They are the expected ones but for loops on the ground over links that lose datagrams: where no newer command
-    arrives, the one before it acts on (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to
-    nothing arrives. A prediction knows the age of each state, whatever was lost.
+    They are the expected ones but for random links: where a datagram is late or lost, the command before it acts on
+    (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to nothing arrives. A prediction knows the
+    age of each state, whatever was lost, so only what set-points are late on average counts.
     """
-    scenario, delays_s = plan.scenario, planned_loop_delays_s(plan)
-    links = {own: scenario.link_of(own) for own in delays_s}
-    is_late = scenario.control.loop == "ground" and scenario.control.prediction == "off"
-    if not is_late or not any(_loses(link) for way in links.values() for link in way):
-        return delays_s
-    rng, held_s = np.random.default_rng(0), plan.timing.held_s
-    found = {way: _effective_s(scenario, *way, held_s, rng) for way in dict.fromkeys(links.values())}
-    return {own: found[way] for own, way in links.items()}
+    scenario, ways, expected_s = plan.scenario, _ways(plan.scenario, _heard(plan)), planned_loop_delays_s(plan)
+    rng, found = np.random.default_rng(0), dict[_Way, float]()
+    for own, (ups, down) in ways.items():
+        counting = (down,) if scenario.control.prediction != "off" else (*ups, down)
+        if (ups, down) not in found and any(_is_random(link) for link in counting):
+            found[ups, down] = _effective_s(plan, ups, down, expected_s[own], rng)
+    return {own: found.get(way, expected_s[own]) for own, way in ways.items()}
 
 
-def _effective_s(scenario: Scenario, up: Link, down: Link, held_s: float, rng: np.random.Generator) -> float:
-    heard, period_s = _heard_over(scenario, up, rng), 1.0 / scenario.rates.control_hz
-    enters, out, main = _stream(down, scenario.rates.control_hz, scenario, rng)
-    late_s = (out - enters)[main > 0.0]
-    if not len(heard.arrived_s):
-        return inf
-    at_all_phases_s = period_s + held_s / len(late_s)
-    ticks = heard.arrived_s[0] + np.arange(len(late_s)) * at_all_phases_s
-    kept = np.isfinite(late_s) & (ticks < heard.newest_s[-1])
+def _effective_s(
+    plan: FlightPlan, ups: Sequence[Link], down: Link, expected_s: float, rng: np.random.Generator
+) -> float:
+    scenario, is_predicted = plan.scenario, plan.scenario.control.prediction != "off"
+    period_s = 1.0 / scenario.rates.control_hz
+    held_s = period_s if is_predicted else plan.timing.held_s
+    late_s = _set_points(scenario, down, rng)[1]
+    ticks = np.arange(len(late_s)) * (period_s + held_s / len(late_s))  # at all phases
+    ages_s = np.zeros(len(ticks))
+    for k, up in enumerate(() if is_predicted else ups, start=1):
+        heard = _heard_over(scenario, up, rng)
+        if not len(heard.arrived_s):
+            return inf
+        # those of other vehicles at all phases to this one's
+        own_ticks = heard.arrived_s[0] + np.arange(len(late_s)) * (period_s + k * held_s / len(late_s))
+        own_ticks[own_ticks > heard.newest_s[-1]] = np.nan
+        sampled_s = heard.newest_s[np.searchsorted(heard.arrived_s, own_ticks, side="right") - 1]
+        ages_s = np.maximum(ages_s, own_ticks - sampled_s)
+    kept = np.isfinite(late_s + ages_s)
     if kept.sum() < 2:
         return inf
-    ticks, late_s = ticks[kept], late_s[kept]
-    sampled_s = heard.newest_s[np.searchsorted(heard.arrived_s, ticks, side="right") - 1]
-    commands = np.rint(NS_PER_S * np.column_stack([ticks + late_s, sampled_s])).astype(np.int64)
-    return effective_delay_s(commands[np.argsort(commands[:, 0], kind="stable")], held_s=held_s)
+    acts_s, sampled_s = (ticks + late_s)[kept], (ticks - ages_s)[kept]
+    commands = np.rint(NS_PER_S * np.column_stack([acts_s, sampled_s])).astype(np.int64)
+    effective_s = effective_delay_s(commands[np.argsort(commands[:, 0], kind="stable")], held_s=held_s)
+    return expected_s + effective_s - float(late_s[kept].mean()) if is_predicted else effective_s
 
 
-def _loses(link: Link) -> bool:
-    return bool(link.loss_probability or link.loss_bursts)
+def setpoint_gaps(scenario: Scenario) -> float:
+    """How often in a flight, over all vehicles, no set-point is expected to arrive for `safety.setpoint_timeout_s`.
+
+    Each vehicle then enters failsafe. Outages of links are not included, nor is bandwidth.
+    """
+    rng, often = np.random.default_rng(0), dict[Link, float]()
+    downs = [scenario.link_of(vehicle.system_id)[1] for vehicle in scenario.vehicles]
+    for down in dict.fromkeys(downs):
+        enters_s, late_s = _set_points(scenario, down, rng)
+        arrived_s = np.sort((enters_s + late_s)[np.isfinite(late_s)])
+        gaps_s = np.diff(arrived_s, append=max(enters_s[-1], arrived_s.max(initial=0.0)))
+        often[down] = float(np.count_nonzero(gaps_s > scenario.safety.setpoint_timeout_s)) / float(enters_s[-1])
+    return scenario.duration_s * sum(often[down] for down in downs)
+
+
+def _set_points(scenario: Scenario, down: Link, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """When each set-point is sent (s), and its one-way delay (s): infinite if it is lost."""
+    enters, out, main = _stream(down, scenario.rates.control_hz, scenario, rng)
+    late_s = (out - enters)[main > 0.0]
+    if scenario.control.execute_at and np.isfinite(late_s).any():
+        late_s = np.maximum(late_s, np.percentile(late_s[np.isfinite(late_s)], 100.0 * HELD_SHARE))
+    return enters[main > 0.0], late_s
+
+
+def _is_random(link: Link) -> bool:
+    return bool(link.jitter or link.loss_probability or link.loss_bursts or link.corrupt_probability)
 
 
 def waits_for_channels(scenario: Scenario) -> bool:
@@ -178,7 +218,7 @@ def _stream(
     """
     span_s = min(_SECONDS, _MOST / rate_hz)
     often = np.arange(0.0, span_s, 1.0 / rate_hz)
-    exchanges = np.arange(0.37 / rate_hz, span_s, 1.0 / min(scenario.rates.timesync_hz, rate_hz))
+    exchanges = np.arange(0.37 / rate_hz, span_s, 1.0 / min(scenario.rates.timesync_hz, scenario.rates.control_hz))
     enters = np.concatenate([often, exchanges])
     order = np.argsort(enters, kind="stable")
     enters, main = enters[order], (order < len(often)).astype(float)
@@ -193,12 +233,10 @@ def _stream(
 
 
 def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
-    """One-way delays of the datagrams that come out."""
-    enters, out, _ = _stream(link, scenario.rates.control_hz, scenario, rng)
-    arrived_s = (out - enters)[np.isfinite(out)] if np.isfinite(out).any() else np.array([link.delay_max_s])
-    if not scenario.control.execute_at:
-        return arrived_s
-    return np.maximum(arrived_s, np.percentile(arrived_s, 100.0 * HELD_SHARE))
+    """One-way delays of the set-points that come out."""
+    late_s = _set_points(scenario, link, rng)[1]
+    arrived_s = late_s[np.isfinite(late_s)]
+    return arrived_s if len(arrived_s) else np.array([link.delay_max_s])
 
 
 class _Heard(NamedTuple):
@@ -222,33 +260,37 @@ def _longest_repetition(scenario: Scenario) -> int:
 
 def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -> FloatArray:
     """Ages of the newest state at random ticks, less how long slower telemetry was repeated; of several, the oldest."""
-    every, period_s = [_heard_over(scenario, up, rng) for up in ups], 1.0 / scenario.rates.control_hz
+    every, rates = [_heard_over(scenario, up, rng) for up in ups], scenario.rates
+    shape, period_s = (_PHASES, _MOST // 2 // _PHASES), 1.0 / rates.control_hz
+    constant_s = np.full(shape, max(up.delay_max_s for up in ups))
     if not all(len(own.arrived_s) for own in every):
-        return np.full(_MOST // 2, max(up.delay_max_s for up in ups))
+        return constant_s
     if len(every) > 1:
         ages = _oldest_s(scenario, every, rng)
-        return ages if len(ages) else np.full(_MOST // 2, max(up.delay_max_s for up in ups))
+        return ages if ages.size else constant_s
     [heard] = every
-    ticks = rng.uniform(0.0, heard.newest_s[-1], _MOST // 2)
+    count = int((heard.newest_s[-1] - heard.arrived_s[0]) / period_s)
+    if count < 1:
+        return constant_s
+    phases_s = np.linspace(0.005, 0.995, _PHASES)[:, np.newaxis] / max(rates.telemetry_hz, rates.control_hz)
+    ticks = heard.arrived_s[0] + rng.integers(count, size=shape) * period_s + phases_s
     place = np.searchsorted(heard.arrived_s, ticks, side="right") - 1
-    ticks, place = ticks[place >= 0], place[place >= 0]
     first = np.searchsorted(heard.newest_s, heard.newest_s[place], side="left")  # the arrival that brought this state
     repeated = np.minimum(np.floor((ticks - heard.arrived_s[first]) / period_s), _longest_repetition(scenario))
-    ages = ticks - heard.newest_s[place] - repeated * period_s
-    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, ups[0].delay_max_s)
+    return ticks - heard.newest_s[place] - repeated * period_s
 
 
 def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Generator) -> FloatArray:
     """Ages (s) of the oldest of the newest states of several vehicles, less how long it was repeated.
 
     Whose state is the oldest changes within a period of slower telemetry, with the phases of the vehicles, which are
-    drawn anew `_PHASES` times. Empty if next to nothing arrives.
+    drawn anew `_DRAWS` times. Empty if next to nothing arrives.
     """
     period_s, longest = 1.0 / scenario.rates.control_hz, _longest_repetition(scenario)
     room_s = min(float(own.newest_s[-1] - own.arrived_s[0]) for own in every)
-    count = max(0, min(max(_MOST // 2 // _PHASES, 4 * longest), int(0.5 * room_s / period_s)))
+    count = max(0, min(max(_MOST // 2 // _DRAWS, 4 * longest), int(0.5 * room_s / period_s)))
     k, found = np.arange(count), list[FloatArray]()
-    for _ in range(_PHASES):
+    for _ in range(_DRAWS):
         ages_s = np.zeros(count)
         for own in every:
             ticks = rng.uniform(own.arrived_s[0], own.newest_s[-1] - count * period_s) + k * period_s
@@ -256,14 +298,15 @@ def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Genera
         changed = np.diff(k * period_s - ages_s, prepend=-1.0) > _SAME_S
         first = np.maximum.accumulate(np.where(changed, k, 0))
         found.append((ages_s - np.minimum(k - first, longest) * period_s)[longest:])
-    return np.concatenate(found)
+    return np.stack(found)
 
 
 def _lost(link: Link, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of so many datagrams are lost."""
+    """Which of so many datagrams are lost, or corrupt, which receivers drop."""
+    lost = rng.random(count) < 1.0 - (1.0 - link.loss_probability) * (1.0 - link.corrupt_probability)
     if (bursts := link.loss_bursts) is None:
-        return rng.random(count) < link.loss_probability
+        return lost
     to_bad, to_good = max(bursts.to_bad_probability, _NEVER), bursts.to_good_probability
     lasts = np.column_stack([rng.geometric(to_bad, count), rng.geometric(to_good, count)])
     is_bad = np.searchsorted(np.cumsum(lasts.ravel()), np.arange(count), side="right") % 2 == 1
-    return rng.random(count) < np.where(is_bad, bursts.loss_bad_probability, bursts.loss_good_probability)
+    return lost | (rng.random(count) < np.where(is_bad, bursts.loss_bad_probability, bursts.loss_good_probability))

@@ -90,7 +90,8 @@ def test_on_board_states_that_are_not_of_one_instant_are_waited_for() -> None:
     flown_s = np.mean([[known(own.loop_delay_s.p50) for own in flight] for flight in flights], axis=0)
     expected_s = [*planned_loop_delays_s(flight_plan(slow)[1]).values()]
     assert expected_s == pytest.approx(flown_s.tolist(), rel=0.1)
-    assert expected_s[1] > expected_s[0] + 0.04  # the vehicle in the middle needs both others
+    # the vehicle in the middle needs both others: 32 ms more with 3,000 draws of their phases
+    assert expected_s[1] - expected_s[0] == pytest.approx(0.032, abs=0.005)
 
 
 @pytest.mark.parametrize("telemetry_hz", [50.0, 10.0])
@@ -108,6 +109,69 @@ def test_where_datagrams_are_lost_older_commands_act_on(telemetry_hz: float) -> 
     assert expected_s == pytest.approx(np.median([*flown_s.values()]), abs=0.01)
     assert expected_s > 1.04 * expected_loop_delay_s(scenario)
     assert check(plan).vehicles[1].link_delay_left_s == pytest.approx(plan.delay_margin_s - expected_s)
+
+
+@pytest.mark.parametrize(("control_hz", "telemetry_hz"), [(20.0, 7.0), (50.0, 50.0)])
+def test_late_datagrams_count_as_lost_ones(control_hz: float, telemetry_hz: float) -> None:
+    calm = calm_chain()
+    slow, fast = (Jitter(distribution="exponential", scale_s=scale_s) for scale_s in (0.15, 0.05))
+    changed = {
+        "links": Links(up=Link(delay_s=0.02, jitter=slow), down=Link(delay_s=0.02, jitter=fast)),
+        "rates": calm.rates.model_copy(update={"control_hz": control_hz, "telemetry_hz": telemetry_hz}),
+        "duration_s": 100.0,
+    }
+    plan = flight_plan(calm.model_copy(update=changed))[1]
+    flight = fly_plan(plan, with_truth=True)
+    rows = flight.ticks[(flight.ticks["time_s"] > 2.0) & (flight.ticks["time_s"] < 98.0)]
+    flown_s = effective_delays_s(plan, rows, flight, plan.formation.system_ids)
+    [expected_s] = set(effective_loop_delays_s(plan).values())
+    assert expected_s == pytest.approx(np.mean([*flown_s.values()]), rel=0.06)
+    assert expected_s > 1.05 * expected_loop_delay_s(plan.scenario)  # the median
+
+
+def losing(down: Link, **control: object) -> Scenario:
+    """Flown without a limit on how long set-points may stay away; at 5 Hz a lost one counts."""
+    calm = calm_chain()
+    rates = calm.rates.model_copy(update={"control_hz": 5.0, "telemetry_hz": 5.0})
+    safety = calm.safety.model_copy(update={"setpoint_timeout_s": 100.0, "heartbeat_timeout_s": 100.0})
+    changed = {
+        "links": Links(up=Link(delay_s=0.02), down=down),
+        "rates": rates,
+        "safety": safety,
+        "control": calm.control.model_copy(update={"delay_margin_s": 0.4, **control}),
+        "duration_s": 60.0,
+    }
+    return calm.model_copy(update=changed)
+
+
+@pytest.mark.parametrize("prediction", ["off", "measured", 0.14])
+def test_a_gate_fails_where_lost_set_points_break_the_flight(prediction: Prediction) -> None:
+    scenario = losing(Link(delay_s=0.02, loss_probability=0.75), prediction=prediction)
+    found = check(flight_plan(scenario)[1])
+    assert found.least_headroom is not None
+    assert found.least_headroom < 0.0 < (found.headroom_p99 or 0.0)
+    assert fly_virtual(scenario).summary.verdict != "stable"
+
+
+def test_corrupt_datagrams_are_lost_ones() -> None:
+    lost, corrupt = (
+        effective_loop_delays_s(flight_plan(losing(Link(delay_s=0.02, **{key: 0.5})))[1])
+        for key in ("loss_probability", "corrupt_probability")
+    )
+    assert corrupt == lost
+
+
+def test_failsafes_are_expected_where_set_points_stay_away() -> None:
+    """A timeout of 0.5 s passes without any of two set-points in a row: a third of them at 5 Hz."""
+    scenario = losing(Link(delay_s=0.02, loss_probability=0.5))
+    scenario = scenario.model_copy(
+        update={"safety": scenario.safety.model_copy(update={"setpoint_timeout_s": 0.5}), "seed": 3}
+    )
+    flown = fly_virtual(scenario)
+    events = [event for event in flown.events if "set-points stopped" in str(event)]
+    # each run of two or more lost ones
+    assert check(flight_plan(scenario)[1]).setpoint_gaps == pytest.approx(3 * 60.0 * 5.0 * 0.5**3, rel=0.1)
+    assert len(events) > 0
 
 
 def test_states_lost_in_bursts_are_late_ones() -> None:
