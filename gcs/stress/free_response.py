@@ -122,7 +122,10 @@ def response_paired(
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_plan(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
-    count = _alike(rows, calm_rows)
+    # the leading rows with the same ticks and the same states used: until one of the flights broke
+    count = min(len(rows), len(calm_rows))
+    same = [rows[name][:count] == calm_rows[name][:count] for name in ("tick", "system_id", "sample_boot_ms")]
+    count = int(np.logical_and.accumulate(np.all(same, axis=0)).sum())
     rows, calm_rows = rows[:count], calm_rows[:count]
     until_s, calm_until_s = (linear_until_s(each, *_linear_range(plan)) for each in (rows, calm_rows))
     errors = rows.copy()
@@ -162,15 +165,6 @@ def linear_error_m_s(scenario: Scenario) -> float:
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
     return chosen(ticks, np.isin(ticks["system_id"], system_ids) & ticks["commanded"] & (ticks["time_s"] >= 0.0))
-
-
-def _alike(rows: TickArray, others: TickArray) -> int:
-    """The number of leading rows with the same ticks and the same states used: until one of the flights broke."""
-    count = min(len(rows), len(others))
-    same = np.ones(count, dtype=bool)
-    for name in ("tick", "system_id", "sample_boot_ms"):
-        same &= rows[name][:count] == others[name][:count]
-    return count if same.all() else int(np.argmin(same))
 
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
