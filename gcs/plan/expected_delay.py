@@ -260,7 +260,6 @@ def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Genera
 
 
 def _lost(link: Link, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of so many datagrams are lost."""
     if (bursts := link.loss_bursts) is None:
         return rng.random(count) < link.loss_probability
     to_bad, to_good = max(bursts.to_bad_probability, _NEVER), bursts.to_good_probability

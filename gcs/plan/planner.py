@@ -198,7 +198,6 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 
 
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
-    """Design and plan with the margins of given responses."""
     if responses is None and plan.scenario.dynamics == "autopilot":
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # the design was found for these
@@ -256,7 +255,6 @@ def described(design: Design, plan: FlightPlan) -> Design:
 def _with_margins(
     design: Design, sampled_s: Sequence[float], continuous_s: Sequence[float | None]
 ) -> tuple[GainSet, ...]:
-    """The design's gain schedule with these margins."""
     return tuple(
         entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
         for entry, own_s, late_s in zip(design.schedule, sampled_s, continuous_s, strict=True)
@@ -291,7 +289,6 @@ def _requirement(scenario: Scenario) -> Requirement:
 
 
 def _graph_design(scenario: Scenario, formation: Formation, pattern: Pattern) -> GraphDesign:
-    """Gains on an information pattern, designed or given block by block."""
     control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
     if control.blocks:

@@ -195,7 +195,6 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
 
 
 def _medians(rows: TickArray, name: str) -> dict[int, float]:
-    """The median of a column for each vehicle that has known values in it, by its system id."""
     columns = {system_id: own[name] for system_id, own in by_vehicle(rows[["system_id", name]]).items()}
     return {key: float(np.median(known)) for key, own in columns.items() if (known := own[np.isfinite(own)]).size}
 
@@ -402,7 +401,6 @@ def _spread(values: FloatArray) -> Spread:
 
 
 def _own_code(scenario: Scenario, design: Design, events: Sequence[Event]) -> dict[str, Any]:
-    """What a summary says about the user's own code; empty for a scenario that names none."""
     if not scenario.code:
         return {}
     fields: dict[str, Any] = {"code": code_records(scenario)}

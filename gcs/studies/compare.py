@@ -129,7 +129,6 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
 
 
 def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
-    """The largest overshoot of a spacing error, as a share of its initial size."""
     shares: list[float] = []
     for system_id in plan.formation.system_ids[1:]:
         own = flown[flown["system_id"] == system_id]

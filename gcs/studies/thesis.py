@@ -290,7 +290,6 @@ def _delay() -> Iterator[Claim]:
 
 
 def _parts(K: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """The gains on own and on others' velocity and spacing errors."""
     spacing = np.isin(np.arange(CHAIN.states), [k for i in CHAIN.followers for k in np.r_[CHAIN.spacing_slice(i)]])
     own = own_part(CHAIN, K)
     for whose, gain in (("own", own), ("others'", K - own)):

@@ -2,15 +2,8 @@
 
 Everything is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at
 0. An entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs
-about as much as a tick of two.
-
-    formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
-    ground/...      the same over the ground, local NED
-    spacing/...     spacing errors of the followers, and the bound below which they count as settled
-    delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
-    headroom/...    in %
-    command/...     accelerations sent
-    modes/ID        the station's judgement of a vehicle;  events: what happened
+about as much as a tick of two. The scene is there twice: formation/... as seen from the leader, in m north, east, down
+of it, and ground/... over the ground, local NED.
 """
 
 import errno

@@ -229,7 +229,6 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
 
 
 def _footer(state: FlightState, figures: Figures) -> list[Text]:
-    """The formation in one line, then the newest events."""
     line = Text(f"least headroom {_worst_headroom(state, figures)}", no_wrap=True)
     line.append(f"   tick lateness p99 {ms_text(figures.lateness_s_p99, '.2f', unit='')} ms")
     if state.skipped:
@@ -334,6 +333,5 @@ def headroom_text(headroom: float | None, before: str = "") -> Text:
 
 
 def _bar(headroom: float) -> str:
-    """Headroom as a bar of ten cells."""
     eighths = int(np.clip(np.nan_to_num(headroom), 0, 1) * 80)
     return ("█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8]).ljust(10)[:10]

@@ -103,7 +103,6 @@ def _name(own: GainsAtDelay) -> str:
 
 
 def _candidate(scenario: Scenario, delays: LinkPart, aim: Aim, *, predicted: bool) -> GainsAtDelay:
-    """The best gains with or without prediction, and their figures."""
     control, period_s, response = scenario.control, loop_timing(scenario).held_s, given_response(scenario)
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
     middle_s, spare = delays.loop_delay_s_p50, 1.0 - delays.headroom

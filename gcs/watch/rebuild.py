@@ -271,7 +271,6 @@ class _Rebuilding:
             self._reported[row] = boot_ms, down + origin_down, v_down, nan, time_ns, bound_s
 
     def _tick(self, due_ns: int, commands: _Commands, key_ms: int) -> None:
-        """The rows of one tick, from what the station knew when it sent these set-points."""
         sent_ns = max((own_ns for own_ns, _ in commands.values()), default=due_ns)
         time_s = (due_ns - self._start_ns) / NS_PER_S
         flying = bool(commands) and time_s >= 0
