@@ -60,10 +60,7 @@ def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode 
     typer.echo(as_toml(responses_of(options.load_scenario(scenario_file, allow_code=allow_code))))
 
 
-def thesis(
-    out: options.OutFolder = None,
-    as_json: options.AsJson = False,
-) -> None:
+def thesis(out: options.OutFolder = None, as_json: options.AsJson = False) -> None:
     """Reproduce the thesis: published beside computed figures."""
     from gcs.studies import thesis as source
     from gcs.views.console import progress

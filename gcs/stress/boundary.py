@@ -208,12 +208,7 @@ def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
 
 
 def _mark(
-    plot: Any,
-    axes: Sequence[Axis],
-    verdicts: Sequence[Outcome],
-    *,
-    dark: NDArray[np.bool_],
-    decays: NDArray[np.bool_],
+    plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], *, dark: NDArray[np.bool_], decays: NDArray[np.bool_]
 ) -> None:
     """Mark the worst verdict of each cell's own-state flights; light marks on dark cells.
 

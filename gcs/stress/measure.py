@@ -176,10 +176,7 @@ def _with_response(
 
 
 def _loop_of(
-    loops: list[CoupledBlock],
-    loop_delay_s: Mapping[int, float],
-    probe: int,
-    age_s: Mapping[int, float] | None = None,
+    loops: list[CoupledBlock], loop_delay_s: Mapping[int, float], probe: int, age_s: Mapping[int, float] | None = None
 ) -> CoupledBlock:
     """The loop of a vehicle, or the one that is predicted to break first."""
     if probe == CRITICAL:
