@@ -152,10 +152,7 @@ def _flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable
 
 
 def _refuse_unusable(
-    least_headroom: float | None,
-    settled_s: float | None,
-    junit: Path | None,
-    out: Path | None,
+    least_headroom: float | None, settled_s: float | None, junit: Path | None, out: Path | None
 ) -> None:
     if out is not None:
         options.refuse_out(out)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gains.design.front import Method
     from gcs.drive.takeover import Presence
     from gcs.drive.udp import StationSocket
-    from gcs.plan.design import Design, GainsAtDelay, LinkPart
+    from gcs.plan.design import GainsAtDelay, LinkPart
     from gcs.studies.front import Comparison, FrontFields
     from scenarios.schema import Scenario
 
@@ -87,14 +87,6 @@ def chosen_now(
     return best_for(scenario, measured_now(scenario, link, start_vehicles=starts, key_file=key_file, shown=shown))
 
 
-def save_scenario(scenario: "Scenario", file: Path) -> None:
-    """Write a scenario that can be flown."""
-    from scenarios.files import dump
-
-    out_file("--save", file)
-    file.write_text(dump(scenario), encoding="utf-8")
-
-
 def show_front(scenario: "Scenario", method: str | None, picture_file: Path | None, *, as_json: bool) -> None:
     """Search the front and print it."""
     from gcs.interrupts import raised
@@ -154,14 +146,8 @@ def _print_front(found: "FrontFields") -> None:
         )
 
 
-def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
-    """Compare the loop delays with prediction and without, and print that."""
-    from gcs.studies.front import compared
-
-    answer(compared(design, name), _print_comparison, as_json=as_json)
-
-
-def _print_comparison(found: "Comparison") -> None:
+def print_comparison(found: "Comparison") -> None:
+    """Print the loop delays with prediction and without."""
     from gcs.views.console import ms_text, number_text, plain_console, table_of
 
     columns: dict[str, Callable[[GainsAtDelay], str]] = {

@@ -157,7 +157,8 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
         console.print(f"{by}{line}")
     if margin.crossings:
         columns: dict[str, Callable[[MarginCrossing], str]] = {
-            "omega rad/s": _omega,
+            # the frequency has about the same relative error as the delay
+            "omega rad/s": lambda c: as_known(c.omega_rad_s, c.delay_error_s / max(c.delay_s, 1e-300) * c.omega_rad_s),
             "period s" if margin.unknown == "period" else "delay s": lambda c: as_known(c.delay_s, c.delay_error_s),
             "roots go": lambda c: {1: "right: unstable", -1: "left: stable", 0: "touch"}[c.direction],
         }
@@ -170,34 +171,25 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
         console.print(windows_table(found.prediction))
 
 
-def _omega(crossing: MarginCrossing) -> str:
-    """The frequency, which has about the same relative error as the delay."""
-    share = crossing.delay_error_s / max(crossing.delay_s, 1e-300)
-    return as_known(crossing.omega_rad_s, share * crossing.omega_rad_s)
-
-
 def _verdict_lines(margin: LoopMargin) -> list[str]:
     name, windows = margin.unknown, margin.stable_intervals_s
+    margin_s, error_s = margin.delay_margin_s, margin.delay_margin_error_s
     lines = [f"{name}: stable from {_end(margin, start)} to {_end(margin, end)}" for start, end in windows[:_ROWS]]
     if len(windows) > _ROWS:
         lines.append(f"and {len(windows) - _ROWS} more windows")
     if not windows:
         lines.append(f"not stable at {name} = 0" if isfinite(margin.complete_to_s) else f"not stable at any {name}")
-    lines.append(_margin_line(margin.delay_margin_s, margin.delay_margin_error_s))
+    if isfinite(margin_s):
+        rough = margin_s > 0.0 and error_s > 0.5e-6 * margin_s
+        why = f", known to {error_s:.0e} s: nearly equal roots cross together" if rough else ""
+        lines.append(f"margin {as_known(margin_s, error_s)} s{why}")
+    else:
+        lines.append("no limit: stable at every delay")
     if margin.unstable_roots_at_zero_delay:
         lines.append(f"unstable roots at {name} = 0: {margin.unstable_roots_at_zero_delay}")
     if margin.checked_by:
         lines.append(f"confirmed by {' and '.join(margin.checked_by)}")
     return lines
-
-
-def _margin_line(margin_s: float, error_s: float) -> str:
-    if not isfinite(margin_s):
-        return "no limit: stable at every delay"
-    line = f"margin {as_known(margin_s, error_s)} s"
-    if margin_s > 0.0 and error_s > 0.5e-6 * margin_s:
-        line += f", known to {error_s:.0e} s: nearly equal roots cross together"
-    return line
 
 
 def _end(margin: LoopMargin, end_s: float) -> str:

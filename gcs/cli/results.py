@@ -38,7 +38,6 @@ _WHOLE_CORE = 0.95
 
 
 def _wide_console() -> Console:
-    """A console; in a file, where no terminal is narrow, it is wide."""
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH

@@ -21,7 +21,7 @@ _RARE = 0.01
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from gcs.drive.check import CourseCheck, PlannedMotionCheck, ScenarioCheck, VehicleCheck
+    from gcs.drive.check import ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
 
 
@@ -161,11 +161,14 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     if found.closest_m is not None:
         when = f", at {found.closest_s:.1f} s" if found.closest_s else ""
         console.print(f"places   at least {found.closest_m:.2f} m between any two vehicles{when}")
-    if found.course is not None:
-        console.print(_course_text(found.course))
-    for motion in found.planned:
-        if motion.beyond:
-            console.print(_beyond_text(motion))
+    if (course := found.course) is not None:
+        length = "" if course.length_m is None else f"{course.length_m:,.0f} m in "
+        turns = f"{course.turns} change{'s' * (course.turns != 1)} of velocity"
+        most = f"{course.acceleration_max_m_s2:.2f} m/s² and {course.jerk_max_m_s3:.2f} m/s³"
+        console.print(f"course   {length}{course.duration_s:.1f} s; {turns}, at most {most}")
+    for motion in (motion for motion in found.planned if motion.beyond):
+        needs = ", ".join(f"{key} {getattr(motion, key):.2f}" for key in motion.beyond)
+        console.print(f"limits   vehicle {motion.system_id} cannot fly the planned motion, which needs {needs}")
     console.print(plan_view({v.system_id: v.place_ne_m for v in found.vehicles}))
     title = "places, their errors and first commands at the start, and the expected loop delays"
     columns: dict[str, Callable[[VehicleCheck], str]] = {
@@ -224,18 +227,6 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
         yield f"failsafe about {often}, after which a vehicle holds"
 
 
-def _course_text(course: "CourseCheck") -> str:
-    length = "" if course.length_m is None else f"{course.length_m:,.0f} m in "
-    turns = f"{course.turns} change{'s' * (course.turns != 1)} of velocity"
-    most = f"at most {course.acceleration_max_m_s2:.2f} m/s² and {course.jerk_max_m_s3:.2f} m/s³"
-    return f"course   {length}{course.duration_s:.1f} s; {turns}, {most}"
-
-
-def _beyond_text(motion: "PlannedMotionCheck") -> str:
-    needs = ", ".join(f"{key} {getattr(motion, key):.2f}" for key in motion.beyond)
-    return f"limits   vehicle {motion.system_id} cannot fly the planned motion, which needs {needs}"
-
-
 def design(
     scenario_file: options.ScenarioFile,
     method: Annotated[
@@ -265,6 +256,7 @@ def design(
     from gcs.plan.disturbed import with_spread
     from gcs.plan.planner import flight_plan, with_trade_off
     from gcs.views.report import print_design
+    from scenarios.files import dump
     from scenarios.keys.own import NO_LAW
 
     scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
@@ -279,10 +271,13 @@ def design(
     scenario = scenario if at is None else fronts.scenario_at(scenario, at, maximise, predict)
     scenario, measured = chosen_for(scenario, links_of)
     if save is not None:
-        fronts.save_scenario(scenario, save)
+        options.out_file("--save", save)
+        save.write_text(dump(scenario), encoding="utf-8")
     result, plan = flight_plan(scenario, measured)
     if compare_prediction:
-        fronts.show_comparison(result, scenario.name, as_json=as_json)
+        from gcs.studies.front import compared
+
+        options.answer(compared(result, scenario.name), fronts.print_comparison, as_json=as_json)
         return
     if (unstable := unstable_loop(plan)) is not None:
         options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)

@@ -60,10 +60,7 @@ def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode 
     typer.echo(as_toml(responses_of(options.load_scenario(scenario_file, allow_code=allow_code))))
 
 
-def thesis(
-    out: options.OutFolder = None,
-    as_json: options.AsJson = False,
-) -> None:
+def thesis(out: options.OutFolder = None, as_json: options.AsJson = False) -> None:
     """Reproduce the thesis: published beside computed figures."""
     from gcs.studies import thesis as source
     from gcs.views.console import progress
@@ -168,7 +165,7 @@ def capacity(
     The links carry a formation if its loop delay stays within the delay margin.
     """
     from gcs.cli.results import print_capacity
-    from gcs.studies.capacity import SECONDS, LoadStore, formations_at_most, unflyable
+    from gcs.studies.capacity import SECONDS, formations_at_most, loads_of, unflyable, write_result
     from gcs.studies.capacity import capacity as capacity_of
     from gcs.views.console import progress
 
@@ -182,7 +179,7 @@ def capacity(
         store = None
         if out is not None:
             folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
-            store = stack.enter_context(contextlib.closing(LoadStore(folder, scenario, resume=resume)))
+            store = stack.enter_context(contextlib.closing(loads_of(folder, scenario, resume=resume)))
         options.say_if_first_flight()
         if not as_json:
             each = f"up to {seeds} flights of {SECONDS:g} s" if seeds > 1 else f"one flight of {SECONDS:g} s"
@@ -194,11 +191,11 @@ def capacity(
             rates_hz=rates_hz,
             most=most,
             seeds=seeds,
-            fly=None if store is None else store.fly,
+            store=store,
             ended=begin("formations, at most"),
         )
-        if store is not None:
-            store.write_result(found)
+        if out is not None:
+            write_result(out, found)
     if as_json:
         options.print_json({"capacities": found})
     else:

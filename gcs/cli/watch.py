@@ -169,7 +169,6 @@ def _formation(scenario_file: Path, given: "Design | None") -> "Scenario":
 
 
 def _save(file: Path, recorder: "LinkRecorder", source: str, *, shown: bool) -> None:
-    """Write the links seen as a profile, and say what they are like."""
     from gcs.watch.saved_links import describe, save
 
     profile = recorder.profile(source)

@@ -108,22 +108,19 @@ class PlannedMotion:
         return [(span.from_s, _array(span.before), _array(span.after)) for span in self._spans[1:]]
 
     def largest(self, row: int) -> Largest:
+        """The extremes at the start and at many instants of every change; in between the motion is steady."""
+        changes = [(span.from_s, span.duration_s) for span in self._spans[1:]]
+        if self._course is not None:
+            changes += [(change.from_s, change.duration_s) for change in self._course.changes]
+        moments = {from_s + duration_s * k / _MOMENTS for from_s, duration_s in changes for k in range(_MOMENTS + 1)}
+        moments |= {0.0, *(entry.from_s for entry in self._scenario.nominal_velocity)}
         slowest, fastest, most, fastest_turn = inf, 0.0, 0.0, 0.0
-        for time_s in self._moments_s():
+        for time_s in sorted(t for t in moments if t <= self._scenario.duration_s):
             _, (v_n, v_e), (a_n, a_e) = self.reference(row, time_s)
             speed = hypot(v_n, v_e)
             slowest, fastest, most = min(slowest, speed), max(fastest, speed), max(most, hypot(a_n, a_e))
             fastest_turn = max(fastest_turn, abs(v_n * a_e - v_e * a_n) / max(speed, 1e-9) ** 2)
         return Largest(slowest, fastest, most, fastest_turn)
-
-    def _moments_s(self) -> list[float]:
-        """Instants at which the motion is evaluated: the start and many in every change; in between it is steady."""
-        changes = [(span.from_s, span.duration_s) for span in self._spans[1:]]
-        if self._course is not None:
-            changes += [(change.from_s, change.duration_s) for change in self._course.changes]
-        moments = {from_s + duration_s * k / _MOMENTS for from_s, duration_s in changes for k in range(_MOMENTS + 1)}
-        steps = [entry.from_s for entry in self._scenario.nominal_velocity]
-        return sorted(t for t in {0.0, *steps, *moments} if t <= self._scenario.duration_s)
 
 
 def _array(places: list[complex]) -> FloatArray:

@@ -248,7 +248,7 @@ class GainsAtDelay(Published):
 
 
 class LinkPart(Published):
-    """What was measured of the links, and why the gains were chosen for them."""
+    """The loop delays over measured links and, once gains are chosen for them, why these."""
 
     source: str
     vehicles: tuple[int, ...]
@@ -256,8 +256,8 @@ class LinkPart(Published):
     loop_delay_s_p50: float
     loop_delay_s_worst: float
     headroom: float
-    maximised: str
-    chosen: str
+    maximised: str = ""
+    chosen: str = ""
     candidates: tuple[GainsAtDelay, ...] = ()
 
 

@@ -34,19 +34,12 @@ def plan_formation(scenario: Scenario) -> Formation:
     """The scenario's formation, its vehicles in `leader_first` order."""
     ordered = scenario.leader_first()
     row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
-    return Formation(
-        system_ids=tuple(row),
-        model=FormationModel(tuple(-1 if v.follows is None else row[v.follows] for v in ordered)),
-        offset_ne_m=_in_north_east(scenario, np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered])),
-    )
-
-
-def _in_north_east(scenario: Scenario, offset_m: FloatArray) -> FloatArray:
-    """The offsets at the start of the flight, turned by the first heading if they turn with the course."""
-    if scenario.course.offsets == "fixed":
-        return offset_m
-    north, east = scenario.nominal_velocity_at(0.0)
-    return offset_m @ np.array([[north, east], [-east, north]]) / np.hypot(north, east)
+    model = FormationModel(tuple(-1 if v.follows is None else row[v.follows] for v in ordered))
+    offset_m = np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered])
+    if scenario.course.offsets != "fixed":  # they turn with the course
+        north, east = scenario.nominal_velocity_at(0.0)
+        offset_m = offset_m @ np.array([[north, east], [-east, north]]) / np.hypot(north, east)
+    return Formation(tuple(row), model, offset_m)
 
 
 def on_one_axis(model: FormationModel, K: FloatArray) -> tuple[FormationModel, FloatArray] | None:

@@ -63,16 +63,11 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
         slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
         around_loss=() if plan.separable else (own,) * len(gains),
     )
-    step_s = 1.0 / plan.scenario.onboard.rate_hz
-    return _with_behaviour(design, step_s).with_schedule(schedule, loop="onboard", onboard=onboard), flown
-
-
-def _with_behaviour(design: Design, step_s: float) -> Design:
-    """The design with the behaviour of inclusion gains in the onboard loop, at the delay used for the ground loop."""
-    if design.inclusion_gains is None or design.behaviour is None:
-        return design
-    found = behaviour(design.inclusion_gains, design.behaviour.delay_s, own_delay_s=step_s / 2.0)
-    return design.model_copy(update={"behaviour": Behaviour.model_validate(plain(asdict(found)))})
+    if design.inclusion_gains is not None and design.behaviour is not None:  # at the delay used for the ground loop
+        own_delay_s = 0.5 / plan.scenario.onboard.rate_hz
+        found = behaviour(design.inclusion_gains, design.behaviour.delay_s, own_delay_s=own_delay_s)
+        design = design.model_copy(update={"behaviour": Behaviour.model_validate(plain(asdict(found)))})
+    return design.with_schedule(schedule, loop="onboard", onboard=onboard), flown
 
 
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:

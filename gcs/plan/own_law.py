@@ -1,14 +1,9 @@
 """The user's own control law: what it is called with, and the design and plan of a scenario that names one.
 
 A law is a function `law(t_s, states, formation, memory)` that returns the acceleration of each vehicle, (N, 2) in m/s²
-north and east. Its arguments:
-
-    t_s        scenario time in s
-    states     (N, 4): position north and east in m, velocity north and east in m/s, all at one instant
-    formation  `LawFormation`: who follows whom and at which distance, v_d, the control period
-    memory     a dict of the law's own, empty at the first call of a flight; the only thing it may remember in
-
-Rows are in the order of `formation.system_ids`. A row of `states` is NaN while that vehicle is lost.
+north and east. `states` are (N, 4), position and velocity north and east at one instant, in the order of
+`formation.system_ids`; the row of a lost vehicle is NaN. `memory` is a dict, empty at the first call of a flight, and
+the only thing that a law may remember in. docs/how-to/own-law.md has the rest.
 """
 
 from collections.abc import Callable
@@ -192,7 +187,6 @@ def code_by_key(scenario: Scenario) -> dict[str, CodeRecord]:
 
 
 def _given_gain(scenario: Scenario, formation: LawFormation) -> FloatArray:
-    """K of the function that states it."""
     name, model = scenario.control.linear, formation.model
     wanted = f"a finite matrix K of u = K e, {model.inputs} x {model.states}, for these {model.vehicles} vehicles"
     matrices = function_of(scenario, "control.linear")

@@ -105,8 +105,11 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
         schedule = [_entry(s, own, blocks=each) for s, own, each in zip(scales, found, blocks, strict=True)]
         ids = formation.system_ids
         parts = {"links": [(ids[i], ids[j]) for i, j in first.links], "blocks": blocks[0]}
-        if control.loop != "onboard":
-            around_loss = _around_loss(model, first.delay_margin_s, scales, period_s)
+        if control.loop != "onboard":  # inclusion gains of the same delay margin, within limits
+            margin_s = float(np.clip(first.delay_margin_s, *_MARGINS_AROUND_LOSS_S))
+            around = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
+            K = model.overlapping_gain(around.K1, around.K2, around.K3)
+            around_loss = tuple(time_scaled(model, K, s) for s in scales)
     else:
         first = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
         slowed = [(first.K1 / s, first.K2 / s, first.K3 / s**2) for s in scales[1:]]
@@ -181,23 +184,20 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
     # gains chosen for a short delay tolerate next to nothing over a long one, where the continuous model takes seconds
     flown = plan.predicted(plan.gain)
     fits = [at_s for at_s in _SHOWN_S if window(flown, at_s)[1] > at_s + plan.timing.held_s]
-    found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *fits})}
+    found = {
+        at_s: WindowAt(
+            assumed_delay_s=at_s,
+            mismatch_window_s=window(flown, at_s),
+            mismatch_window_continuous_s=continuous_window(flown, at_s),
+            jump_s=proved_jump_s(flown, at_s),
+        )
+        for at_s in sorted({assumed_s or _SHOWN_S[0], *fits})
+    }
     own = dict.fromkeys(WindowAt.model_fields) if assumed_s is None else found[assumed_s].model_dump()
     return PredictionPart.model_validate(own | {"windows": tuple(found.values()), "assumes": assumption(plan.scenario)})
 
 
-def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
-    flown = plan.predicted(plan.gain)
-    return WindowAt(
-        assumed_delay_s=assumed_s,
-        mismatch_window_s=window(flown, assumed_s),
-        mismatch_window_continuous_s=continuous_window(flown, assumed_s),
-        jump_s=proved_jump_s(flown, assumed_s),
-    )
-
-
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
-    """Design and plan with the margins of given responses."""
     if responses is None and plan.scenario.dynamics == "autopilot":
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # the design was found for these
@@ -255,7 +255,6 @@ def described(design: Design, plan: FlightPlan) -> Design:
 def _with_margins(
     design: Design, sampled_s: Sequence[float], continuous_s: Sequence[float | None]
 ) -> tuple[GainSet, ...]:
-    """The design's gain schedule with these margins."""
     return tuple(
         entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
         for entry, own_s, late_s in zip(design.schedule, sampled_s, continuous_s, strict=True)
@@ -290,7 +289,6 @@ def _requirement(scenario: Scenario) -> Requirement:
 
 
 def _graph_design(scenario: Scenario, formation: Formation, pattern: Pattern) -> GraphDesign:
-    """Gains on an information pattern, designed or given block by block."""
     control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
     if control.blocks:
@@ -322,13 +320,3 @@ def _given_gain(scenario: Scenario, formation: Formation) -> FloatArray:
     for block in scenario.control.blocks:
         K[model.input_slice(row(block.vehicle)), model.output_slice(row(block.of))] = block.gain
     return K
-
-
-def _around_loss(
-    model: FormationModel, delay_margin_s: float, scales: tuple[float, ...], period_s: float
-) -> tuple[FloatArray, ...]:
-    """Inclusion gains of the same delay margin, within limits, slowed down by each factor."""
-    margin_s = min(max(delay_margin_s, _MARGINS_AROUND_LOSS_S[0]), _MARGINS_AROUND_LOSS_S[1])
-    found = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
-    K = model.overlapping_gain(found.K1, found.K2, found.K3)
-    return tuple(time_scaled(model, K, scale) for scale in scales)

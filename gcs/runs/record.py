@@ -136,7 +136,6 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
 
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
-    """The tables of the datagrams of each network."""
     numbers = arrivals.table[2].tolist()
     # `addresses` may hold every sender heard so far, strangers too: look only at those of this table
     network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}

@@ -195,7 +195,6 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
 
 
 def _medians(rows: TickArray, name: str) -> dict[int, float]:
-    """The median of a column for each vehicle that has known values in it, by its system id."""
     columns = {system_id: own[name] for system_id, own in by_vehicle(rows[["system_id", name]]).items()}
     return {key: float(np.median(known)) for key, own in columns.items() if (known := own[np.isfinite(own)]).size}
 
@@ -260,6 +259,9 @@ def _vehicle(
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
     margins_s, rtt = sent["delay_margin_s"], estimate(rows["rtt_s"])
+    with np.errstate(invalid="ignore"):  # a margin of 0, at which the headroom is minus infinity
+        # what is left of the margin; with prediction of the distance to the window's end
+        headroom_s = sent["headroom"] * (margins_s - sent["assumed_delay_s"])
     modes = (own if completed else rows)["mode"]
     if (modes != Mode.WAITING).any():  # every vehicle is WAITING again once it is told to hold at the end
         modes = modes[modes != Mode.WAITING]
@@ -271,7 +273,7 @@ def _vehicle(
         loop_delay_s=estimate(sent["loop_delay_s"]),
         delay_margin_s=MarginRange(min=margins_s.min(initial=np.inf), max=margins_s.max(initial=-np.inf)),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
-        headroom_min_s=np.fmin.reduce(_headroom_s(sent), initial=np.nan),
+        headroom_min_s=np.fmin.reduce(headroom_s, initial=np.nan),
         up_delay_s=_one_way(sent["up_delay_s"], sent["sample_bound_s"]),
         down_delay_s=_one_way(sent["down_delay_s"], sent["down_bound_s"]),
         telemetry_age_s=estimate(sent["telemetry_age_s"]),
@@ -280,12 +282,6 @@ def _vehicle(
         mode_final=Mode(int(modes[-1])).name if modes.size else None,
         **counted,
     )
-
-
-def _headroom_s(rows: TickArray) -> FloatArray:
-    """Headroom as a time: what is left of the margin; with prediction of the distance to the window's end."""
-    with np.errstate(invalid="ignore"):  # a margin of 0, at which the headroom is minus infinity
-        return rows["headroom"] * (rows["delay_margin_s"] - rows["assumed_delay_s"])
 
 
 def estimate(values: FloatArray) -> Estimate:
@@ -405,7 +401,6 @@ def _spread(values: FloatArray) -> Spread:
 
 
 def _own_code(scenario: Scenario, design: Design, events: Sequence[Event]) -> dict[str, Any]:
-    """What a summary says about the user's own code; empty for a scenario that names none."""
     if not scenario.code:
         return {}
     fields: dict[str, Any] = {"code": code_records(scenario)}

@@ -14,14 +14,14 @@ from gcs.published import Published
 from gcs.runs.record import STARTED, event_fields
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """A float to nine decimals; None for one that is not finite: JSON has no infinity."""
     if not isinstance(value, float):
         return value
     return round(float(value), 9) if isfinite(value) else None
 
 
-Number = Annotated[float | None, BeforeValidator(_rounded)]
+Number = Annotated[float | None, BeforeValidator(rounded)]
 """None where it is unknown or without bound."""
 
 
@@ -161,12 +161,6 @@ class Summary(Published):
     margin_unknown: str = ""
     law: LawRecord | None = None
     code: tuple[CodeRecord, ...] = ()
-
-    @property
-    def closest_to_margin(self) -> VehicleSummary | None:
-        """The vehicle that had the least headroom."""
-        known = [vehicle for vehicle in self.vehicles if vehicle.headroom_min is not None]
-        return min(known, key=lambda vehicle: vehicle.headroom_min or 0.0, default=None)
 
     @property
     def spacing_error_final_m(self) -> float | None:

@@ -208,20 +208,17 @@ def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
 
 
 def _mark(
-    plot: Any,
-    axes: Sequence[Axis],
-    verdicts: Sequence[Outcome],
-    *,
-    dark: NDArray[np.bool_],
-    decays: NDArray[np.bool_],
+    plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], *, dark: NDArray[np.bool_], decays: NDArray[np.bool_]
 ) -> None:
-    """Mark the verdict of each cell's own-state flights; light marks on dark cells.
+    """Mark the worst verdict of each cell's own-state flights; light marks on dark cells.
 
     An error that persists where small errors decay is not an instability of the loop: large initial errors met a limit,
     or random links keep pushing the vehicles.
     """
     across, up = (np.array(axis.values) for axis in axes)
-    found = _verdicts(axes, verdicts)
+    flown = [{outcome.verdict for outcome in cell} for cell in _of_cells(axes, verdicts)]
+    worst = [next((v for v in ("unstable", "aborted", "stable") if v in own), "") for own in flown]
+    found = np.array(worst).reshape([len(axis.values) for axis in axes])
     for cells, marker, size, filled, meaning in (
         ((found == "unstable") & ~decays, "x", 22, True, "unstable"),
         ((found == "unstable") & decays, "o", 22, False, "an error stays, though small ones die away"),
@@ -260,10 +257,3 @@ def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> Flo
     known = [[v for o in cell if (v := getattr(o, field)) is not None] for cell in _of_cells(axes, outcomes)]
     means = [float(np.mean(values)) if values else np.nan for values in known]
     return np.array(means).reshape([len(axis.values) for axis in axes])
-
-
-def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.str_]:
-    """The worst verdict of all seeds at each point, empty where nothing was flown."""
-    found = [{outcome.verdict for outcome in cell} for cell in _of_cells(axes, outcomes)]
-    worst = [next((v for v in ("unstable", "aborted", "stable") if v in verdicts), "") for verdicts in found]
-    return np.array(worst).reshape([len(axis.values) for axis in axes])

@@ -243,14 +243,11 @@ def write_table(outcomes: Iterable[Outcome], folder: Path) -> None:
     write_parquet(folder / PARQUET_FILE, {name: [row.get(name) for row in rows] for name in names})
 
 
-def _leave_to_parent(*_: object) -> None: ...
-
-
 def _prepare_worker(parent: int) -> None:
     """Leave signals of the terminal to the parent, and die with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup it stays ignored
-        signal.signal(signal.SIGHUP, _leave_to_parent)
+        signal.signal(signal.SIGHUP, lambda _, __: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, FROM_TERMINAL)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # the parent died while this process was starting

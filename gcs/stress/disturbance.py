@@ -23,7 +23,7 @@ from gcs.plan.formation import on_one_axis
 from gcs.published import Published
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import LINEAR_COMMAND_M_S2, linear_error_m_s, linear_until_s, probe_scenario
-from gcs.stress.growth import GrowthPoint, Zero, fit_growth, locate_zero, motion_of
+from gcs.stress.growth import GrowthPoint, fit_growth, locate_zero, motion_of
 from scenarios.keys.disturbance import Disturbance, Sector
 from scenarios.schema import Scenario
 
@@ -192,8 +192,10 @@ def _onset(
         zero = locate_zero([point for point in points if abs(point.varied - middle) <= 1.001 * width])
         if zero is not None and zero.inside:
             break
-        # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
-        middle += _way(zero, points, middle, width)
+        if zero is not None:  # to where growth seems to pass zero, three widths at most
+            middle += float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
+        else:  # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
+            middle += -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
     inside = zero if zero is not None and zero.inside else None
     onset = None if inside is None else inside.varied
     return DisturbanceOnset(
@@ -206,13 +208,6 @@ def _onset(
         difference=None if onset is None else onset / radius - 1.0,
         flights=len(points),
     )
-
-
-def _way(zero: Zero | None, points: Sequence[GrowthPoint], middle: float, width: float) -> float:
-    """How far to the next middle: to where growth seems to pass zero, three widths at most."""
-    if zero is not None:
-        return float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
-    return -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:

@@ -3,35 +3,25 @@
 A *probe* is a flight in which the formation starts exactly in place at its nominal velocity, except for a small error
 of the vehicles of one loop. Nothing acts on the vehicles ahead, so the flight shows the free response of that loop
 alone. Where every vehicle has errors, identical loops along the chain drive each other at resonance (t^k e^{st}), and
-growth can be read only after a long time.
+growth can be read only after a long time. A probe removes everything that would mask this response:
 
-A probe removes everything that would mask this response:
+* Clock drift, which moves the sampling instants and with them the loop delay. It remains on links that lose or delay
+  at random, where delays vary in any case.
+* Differences between clocks and between links. The station extrapolates states to one instant. It would see errors of
+  up to v T of vehicles that report a velocity but still stand on the launcher, and of half the asymmetry of links. So
+  all vehicles have the same clock and the links of the probed one. Its loop's wait for the control tick is restored by
+  moving less than one period of delay between the up and down links.
+* Changes of the nominal velocity, the noise of sensors, the failsafe, which lossy links would trigger, and the limit on
+  the spacing error: a growing error must be seen for long enough to be measured.
+* The vehicles' limits: a clipped response is not linear, and random links push vehicles by more than an error of a
+  millimetre. `past_limits` says when. Autopilots keep their limits; their flight counts while it is far from them.
+* With autopilots, the offsets between local frames (up to 5 mm each), clocks that jump, and the start from rest: the
+  formation hovers in place, where the loop is the same as at any velocity.
 
-* Clock drift moves the sampling instants, and with them the loop delay while it is being measured. It remains only
-  on links that lose or delay at random, where delays vary in any case.
-* Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
-  it would see errors of up to v T where there are none, and push every vehicle at the start. A probe gives all vehicles
-  the same clock: they sample at the same instant, and this error is absent. The probed loop's wait for the control tick
-  then no longer follows from its clock; it is restored by moving less than one period of delay between the up and down
-  links.
-* Links that differ start the vehicles at different instants. They also leave each clock estimate wrong by half
-  the asymmetry of its links, which the station sees as errors. So all vehicles have the links of the probed one. Its
-  loop is unchanged: the station extrapolates the others' states to the instant of its own.
-* Changes of the nominal velocity, and the noise of the vehicles' sensors.
-* The vehicles' failsafe, which lossy links would trigger now and then: it opens the loop.
-* The scenario's limit on the spacing error: a growing error must be seen for long enough to be measured.
-* The vehicles' limits. A small error stays within them, where the loop is the same. But links that lose or delay at
-  random push vehicles by more than an error of a millimetre, and a response clipped by limits is not linear.
-  `past_limits` says when that happens. Autopilots keep their limits; their flight counts while it is far from them.
-* With autopilots, the offsets between local frames (up to 5 mm each, the last digit of a latitude), clocks that jump,
-  and the start from rest: the formation hovers in place, where the loop is the same as at any velocity. Take-off and
-  identification come before scenario time zero and are not part of the response.
-
-On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time, because the
-station's estimates of clocks and instants are wrong, and errors travel down the chain. But the loops are linear, and
-the links draw the same delays whatever they carry. So the formation is flown twice with the same seed, once in place
-and once with one loop disturbed. The difference of the two flights is the free response of that loop through the drawn
-delays, exact to the last digit of telemetry.
+On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time. But the loops
+are linear, and the links draw the same delays whatever they carry. So the formation is flown twice with the same seed,
+once in place and once with one loop disturbed. The difference of the two flights is the free response of that loop
+through the drawn delays, exact to the last digit of telemetry.
 """
 
 from dataclasses import dataclass, replace
@@ -122,7 +112,10 @@ def response_paired(
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_plan(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
-    count = _alike(rows, calm_rows)
+    # the leading rows with the same ticks and the same states used: until one of the flights broke
+    count = min(len(rows), len(calm_rows))
+    same = [rows[name][:count] == calm_rows[name][:count] for name in ("tick", "system_id", "sample_boot_ms")]
+    count = int(np.logical_and.accumulate(np.all(same, axis=0)).sum())
     rows, calm_rows = rows[:count], calm_rows[:count]
     until_s, calm_until_s = (linear_until_s(each, *_linear_range(plan)) for each in (rows, calm_rows))
     errors = rows.copy()
@@ -162,15 +155,6 @@ def linear_error_m_s(scenario: Scenario) -> float:
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
     return chosen(ticks, np.isin(ticks["system_id"], system_ids) & ticks["commanded"] & (ticks["time_s"] >= 0.0))
-
-
-def _alike(rows: TickArray, others: TickArray) -> int:
-    """The number of leading rows with the same ticks and the same states used: until one of the flights broke."""
-    count = min(len(rows), len(others))
-    same = np.ones(count, dtype=bool)
-    for name in ("tick", "system_id", "sample_boot_ms"):
-        same &= rows[name][:count] == others[name][:count]
-    return count if same.all() else int(np.argmin(same))
 
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:

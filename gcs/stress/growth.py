@@ -88,7 +88,11 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
         rows, time_s = rows[first], (boot_ms - boot_ms[:1]) * 1e-3
         values = np.stack([rows[name] for name in CHANNELS], axis=1).astype(np.float64)
         values = values[:, np.isfinite(values).all(axis=0)]  # the leader has no spacing error
-        columns.append(_equally_spaced(time_s, values, period_s))
+        if len(time_s) >= 4 and not np.allclose(np.diff(time_s), period_s, rtol=0.0, atol=1e-6):
+            from scipy.interpolate import CubicSpline  # slow to import, and rarely needed
+
+            values = CubicSpline(time_s, values)(np.arange(0.0, time_s[-1], period_s))
+        columns.append(values)
     count = min((len(column) for column in columns), default=0)
     values = np.hstack([column[:count] for column in columns]) if columns else np.empty((0, 0))
     return Motion(np.arange(count, dtype=np.float64) * period_s, values, period_s)
@@ -196,14 +200,6 @@ def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, F
     values = motion.values[inside]
     values = values[: _count_before_rest(values)]
     return motion.time_s[inside][: len(values)], values
-
-
-def _equally_spaced(time_s: FloatArray, values: FloatArray, period_s: float) -> FloatArray:
-    if len(time_s) < 4 or np.allclose(np.diff(time_s), period_s, rtol=0.0, atol=1e-6):
-        return values
-    from scipy.interpolate import CubicSpline  # slow to import, and rarely needed
-
-    return CubicSpline(time_s, values)(np.arange(0.0, time_s[-1], period_s))
 
 
 def _count_before_rest(values: FloatArray) -> int:
@@ -318,8 +314,8 @@ class Zero:
 def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
     """Where growth is zero, from at least two flights that differ in what was varied.
 
-    Fits a line, or a parabola to four or more flights, by least squares weighted with the flights' errors. None if
-    growth does not rise with what was varied.
+    Fits a line, or a parabola to four or more flights, by least squares weighted with the flights' errors. Of several
+    rising zeros it is the one nearest to the flight of least growth. None if growth does not rise with what was varied.
     """
     if len({round(point.varied, 6) for point in points}) < 2:
         return None
@@ -331,10 +327,13 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
     for degree in (2, 1) if len(points) >= 4 else (1,):
         weighted = np.vander(x, degree + 1) / error[:, np.newaxis]
         coefficients = np.linalg.lstsq(weighted, growth / error, rcond=None)[0]
-        at = _rising_root(coefficients, nearest_to=float(x[np.abs(growth).argmin()]))
-        if at is not None:
+        roots, slopes = np.roots(coefficients), np.polyder(coefficients)
+        real = roots[np.abs(roots.imag) < 1e-9].real
+        rising = real[np.polyval(slopes, real) > 0.0]
+        if rising.size:
+            at = float(rising[np.abs(rising - x[np.abs(growth).argmin()]).argmin()])
             row = at ** np.arange(degree, -1, -1.0)
-            slope = float(np.polyval(np.polyder(coefficients), at))
+            slope = float(np.polyval(slopes, at))
             variance = float(row @ np.linalg.pinv(weighted.T @ weighted) @ row)
             off, free = weighted @ coefficients - growth / error, len(points) - degree - 1
             misfit = float(np.linalg.norm(off)) / free**0.5 if free else 0.0
@@ -346,11 +345,3 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
                 misfit=misfit,
             )
     return None
-
-
-def _rising_root(coefficients: FloatArray, *, nearest_to: float) -> float | None:
-    """The root at which a polynomial rises; if there are several, the one nearest to a given place."""
-    roots = np.roots(coefficients)
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    rising = real[np.polyval(np.polyder(coefficients), real) > 0.0]
-    return float(rising[np.abs(rising - nearest_to).argmin()]) if rising.size else None

@@ -21,11 +21,12 @@ from gcs.drive.flown import first_uses, fly_plan, median_ages_s, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import is_modelled, plan_loops, plan_over_links
+from gcs.runs.summary_record import rounded
 from gcs.stress import free_response
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
-from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_of, with_verdict
+from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, plan_of, with_verdict
 
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
@@ -175,10 +176,7 @@ def _with_response(
 
 
 def _loop_of(
-    loops: list[CoupledBlock],
-    loop_delay_s: Mapping[int, float],
-    probe: int,
-    age_s: Mapping[int, float] | None = None,
+    loops: list[CoupledBlock], loop_delay_s: Mapping[int, float], probe: int, age_s: Mapping[int, float] | None = None
 ) -> CoupledBlock:
     """The loop of a vehicle, or the one that is predicted to break first."""
     if probe == CRITICAL:
@@ -220,8 +218,8 @@ def _with_prediction(
         return outcome
     return replace(
         outcome,
-        predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s, age_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(loop_delay_s, age_s)),
+        predicted_growth_1_s=rounded(loop.growth_at_1_s(loop_delay_s, age_s)),
+        predicted_growth_continuous_1_s=rounded(loop.growth_continuous_at_1_s(loop_delay_s, age_s)),
     )
 
 
@@ -255,9 +253,9 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
 def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
     return replace(
         outcome,
-        growth_1_s=finite(growth.growth_1_s),
-        growth_error_1_s=finite(growth.error_1_s),
-        frequency_rad_s=finite(growth.frequency_rad_s),
+        growth_1_s=rounded(growth.growth_1_s),
+        growth_error_1_s=rounded(growth.error_1_s),
+        frequency_rad_s=rounded(growth.frequency_rad_s),
         fit_start_s=round(growth.start_s, 6),
         fit_end_s=round(growth.end_s, 6),
         fit_samples=growth.samples,

@@ -198,7 +198,6 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
 
 def _not_located(flights: Sequence[Outcome], scattered: Zero | None) -> NoOnset:
-    """Why these flights tell no onset."""
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
     flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
     if scattered is not None:
@@ -247,7 +246,6 @@ def _no_limit(slowed: _Slowed, run: Run, *, tolerance: float) -> NoOnset:
 
 
 def _growth_pairs(outcomes: Sequence[Outcome]) -> list[tuple[float, float]]:
-    """Measured and predicted growth rates, where both are known."""
     pairs = ((outcome.growth_1_s, outcome.predicted_growth_1_s) for outcome in outcomes)
     return [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
 

@@ -20,6 +20,7 @@ from gcs.plan.formation import plan_formation
 from gcs.plan.loops import unlimited
 from gcs.plan.own_law import law_of
 from gcs.runs.summary import control_of, judge
+from gcs.runs.summary_record import rounded
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
@@ -141,8 +142,8 @@ def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
         outcome,
         verdict=judged.verdict,
         reason=judged.reason,
-        spacing_error_max_m=finite(max((most_m for most_m, _ in judged.spacing_errors_m), default=None)),
-        spacing_error_final_m=finite(max((last_m for _, last_m in judged.spacing_errors_m), default=None)),
+        spacing_error_max_m=rounded(max((most_m for most_m, _ in judged.spacing_errors_m), default=None)),
+        spacing_error_final_m=rounded(max((last_m for _, last_m in judged.spacing_errors_m), default=None)),
         lateness_s_p50=lateness_s.p50,
         lateness_s_p99=lateness_s.p99,
         steal_share=flight.steal_share,
@@ -164,8 +165,3 @@ def _trace(ticks: TickArray) -> list[float]:
     largest = np.zeros(int(stretch.max()) + 1)
     np.maximum.at(largest, stretch, error)
     return [float(f"{value:.4g}") for value in largest]
-
-
-def finite(value: float | None) -> float | None:
-    """The value rounded to nine decimals; None if it is not finite."""
-    return round(float(value), 9) if value is not None and np.isfinite(value) else None

@@ -87,10 +87,6 @@ class _Counted:
         return arrived
 
 
-FlyLoaded = Callable[[Scenario, float, int], Load]
-"""Flies a scenario at a rate (Hz) with a number of vehicles, as `fly_loaded`."""
-
-
 def capacity(
     scenario: Scenario,
     *,
@@ -98,14 +94,14 @@ def capacity(
     most: int,
     seeds: int = 3,
     seconds: float = SECONDS,
-    fly: FlyLoaded | None = None,
+    store: Store[Load] | None = None,
     ended: Callable[[int], None] = lambda _: None,
 ) -> list[Capacity]:
     """The capacity at each rate, up to `most` vehicles: the size doubles until one fails, then bisection.
 
     Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
-    decay slowly near the margin. `fly` flies in the place of `fly_loaded`; `ended` is called after each formation with
-    the greatest number still to come. Raises InputError if the scenario is `unflyable`.
+    decay slowly near the margin. Those in `store` are not flown again, the others are added to it; `ended` is called
+    after each formation with the greatest number still to come. Raises InputError if the scenario is `unflyable`.
     """
     if fault := unflyable(scenario, most, seconds):
         raise InputError(f"{scenario.name}: {fault}")
@@ -115,7 +111,7 @@ def capacity(
         own, low, count = Capacity(rate_hz, most=None, next=None), FEWEST - 1, FEWEST
         while count > low:
             try:
-                load = worst_load(scenario, rate_hz, count, seeds, fly)
+                load = worst_load(scenario, rate_hz, count, seeds, store)
             except GainsError as error:
                 own, count = replace(own, failed=str(error)), 0
             else:
@@ -153,13 +149,18 @@ def _at_most(low: int, count: int, beyond: Load | None, most: int) -> int:
     return doublings + ceil(log2(max(1, (most + 1 if beyond is None else beyond.vehicles) - low)))
 
 
-def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, fly: FlyLoaded | None = None) -> Load:
+def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, store: Store[Load] | None = None) -> Load:
     """The first flight that does not hold; if all do, the one of least headroom."""
     loads: list[Load] = []
     for seed in range(scenario.seed, scenario.seed + seeds):
-        loads.append((fly or fly_loaded)(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles))
-        if not loads[-1].holds:
-            return loads[-1]
+        load = None if store is None else store.flown.get((rate_hz, vehicles, seed))
+        if load is None:
+            load = fly_loaded(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles)
+            if store is not None:
+                store.add(load)
+        if not load.holds:
+            return load
+        loads.append(load)
     return min(loads, key=lambda load: load.headroom_p01 or 0.0)
 
 
@@ -241,28 +242,16 @@ def _displaced(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update={"vehicles": tuple(vehicles)})
 
 
-class LoadStore:
-    """Flies formations as `fly_loaded` does, except those whose flight the folder already holds.
+def loads_of(folder: Path, scenario: Scenario, *, resume: bool) -> Store[Load]:
+    """The finished flights of a study's folder, by rate, vehicles and seed.
 
     Raises InputError if the folder is to be resumed and holds no study of this scenario.
     """
+    if resume:
+        check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))
+    write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
+    return Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 
-    def __init__(self, folder: Path, scenario: Scenario, *, resume: bool) -> None:
-        self._folder = folder
-        if resume:
-            check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))
-        write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
-        self._store = Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 
-    def fly(self, scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
-        """The flight of this many vehicles at a rate, from the folder or flown now."""
-        flown, key = self._store.flown, (rate_hz, vehicles, scenario.seed)
-        if key not in flown:
-            self._store.add(fly_loaded(scenario, rate_hz, vehicles))
-        return flown[key]
-
-    def write_result(self, found: list[Capacity]) -> None:
-        write_whole(self._folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())
-
-    def close(self) -> None:
-        self._store.close()
+def write_result(folder: Path, found: list[Capacity]) -> None:
+    write_whole(folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())

@@ -113,7 +113,6 @@ def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
 
 
 def _not_flown(trial: Trial) -> Outcome:
-    """An outcome of the usual size."""
     return Outcome(trial.id, trial.kind, trial.scenario.seed, {}, real_time=False, trace_m=[0.5] * _TRACE)
 
 

@@ -106,7 +106,8 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
     model, K = plan.model, plan.gain
     squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
-    links, numbers = _information(model, K)
+    pairs = permutations(range(model.vehicles), 2)
+    used = [K[model.input_slice(i), model.output_slice(j)].any(axis=0) for i, j in pairs]
     route = Route(
         method=method,
         design_s=design_s,
@@ -121,14 +122,13 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
         delay_margin_continuous_s=summary.delay_margin_continuous_s,
         decay_rate_1_s=-abscissa(model.A + model.B @ K),
         string_peak=string_peak(model, K),
-        links=links,
-        numbers_used=numbers,
+        links=sum(bool(numbers.any()) for numbers in used),
+        numbers_used=sum(int(numbers.sum()) for numbers in used),
     )
     return route, flight.ticks
 
 
 def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
-    """The largest overshoot of a spacing error, as a share of its initial size."""
     shares: list[float] = []
     for system_id in plan.formation.system_ids[1:]:
         own = flown[flown["system_id"] == system_id]
@@ -138,14 +138,6 @@ def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
         if first > 0.1:  # smaller ones are noise at the start
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
-
-
-def _information(model: FormationModel, K: FloatArray) -> tuple[int, int]:
-    """The number of pairs (i, j) in which i uses errors of j, and the number of these errors per axis."""
-    blocks = [
-        K[model.input_slice(i), model.output_slice(j)].any(axis=0) for i, j in permutations(range(model.vehicles), 2)
-    ]
-    return sum(bool(used.any()) for used in blocks), sum(int(used.sum()) for used in blocks)
 
 
 def string_peak(model: FormationModel, K: FloatArray) -> float | None:

@@ -27,6 +27,7 @@ from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, bidirectional, checked_pattern_gain, formation_plant, leader_follower
 from gains.margin.opinions import checked_delay_margin
 from gains.sampled.onboard import own_part
+from gcs.stress.disturbance import find_disturbance_onsets
 from gcs.studies import thesis_flights
 from gcs.studies.thesis_flights import ALPHA, CHAIN, DELAYS_S, SINGLE, flown, printed_gains
 from gcs.views.page import rendered
@@ -130,13 +131,15 @@ def _inclusion() -> Iterator[Claim]:
 
 
 def _disturbance() -> Iterator[Claim]:
-    delay_s, onset = thesis_flights.disturbance_onset()
+    _, plan = thesis_flights.planned("triangle5", "inclusion")
+    found = find_disturbance_onsets(plan, tolerance=0.01, kinds=("dynamic",), counts=(2,))
+    [onset] = found.onsets
     assert onset.onset_1_s is not None
     yield Claim(
         "(3.20)-(3.24)", "disturbance w: stable under every |w| ≤ α |e| of a follower and the vehicle in front",
         f"{ALPHA}, not flown",
         f"the worst w makes the formation unstable from {onset.onset_1_s:.4f} 1/s on in flight, at "
-        f"{1e3 * delay_s:.0f} ms of loop delay: `gcs stress SCENARIO --disturbance --onset`",
+        f"{1e3 * found.loop_delay_s:.0f} ms of loop delay: `gcs stress SCENARIO --disturbance --onset`",
         f"complex stability radius of the sampled loop {onset.radius_1_s:.4f} 1/s", "agrees",
     )  # fmt: skip
 
@@ -287,7 +290,6 @@ def _delay() -> Iterator[Claim]:
 
 
 def _parts(K: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """The gains on own and on others' velocity and spacing errors."""
     spacing = np.isin(np.arange(CHAIN.states), [k for i in CHAIN.followers for k in np.r_[CHAIN.spacing_slice(i)]])
     own = own_part(CHAIN, K)
     for whose, gain in (("own", own), ("others'", K - own)):

@@ -18,7 +18,6 @@ from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
-from gcs.stress.disturbance import DisturbanceOnset, find_disturbance_onsets
 from gcs.views.page import figure_of, saved
 from scenarios.files import load
 from scenarios.schema import Scenario
@@ -72,21 +71,13 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
 @cache
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
     """Fly one of the triangle scenarios without link delay; returns its ticks and settling time."""
-    designed, plan = _planned(name, method)
+    designed, plan = planned(name, method)
     flight = fly_plan(plan)
     return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events).settling_time_s
 
 
-def disturbance_onset() -> tuple[float, DisturbanceOnset]:
-    """The loop delay (s) of triangle5 at α = 0.93 without link delay, and the worst w of one follower that it takes."""
-    found = find_disturbance_onsets(
-        _planned("triangle5", "inclusion")[1], tolerance=0.01, kinds=("dynamic",), counts=(2,)
-    )
-    return found.loop_delay_s, found.onsets[0]
-
-
 @cache
-def _planned(name: str, method: str) -> tuple[Design, FlightPlan]:
+def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
     """The plan of a scenario without link delay, with gains of inclusion at α = 0.93, or of a graph method at the same
     delay margin."""
     scenario = _scenario(name)

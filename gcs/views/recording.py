@@ -2,15 +2,8 @@
 
 Everything is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at
 0. An entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs
-about as much as a tick of two.
-
-    formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
-    ground/...      the same over the ground, local NED
-    spacing/...     spacing errors of the followers, and the bound below which they count as settled
-    delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
-    headroom/...    in %
-    command/...     accelerations sent
-    modes/ID        the station's judgement of a vehicle;  events: what happened
+about as much as a tick of two. The scene is there twice: formation/... as seen from the leader, in m north, east, down
+of it, and ground/... over the ground, local NED.
 """
 
 import errno
@@ -31,6 +24,7 @@ from gains.core.arrays import FloatArray
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
+from gcs.plan.formation import plan_formation
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views import scene
 from gcs.views.scene import Color
@@ -111,8 +105,11 @@ class Recording:
         self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
-        if self._events:
-            self._send_events(self._events)
+        if said := at_once(self._events):
+            times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
+            texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
+            levels = [_event_level(event) for event, _ in said]
+            self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
         ticks = np.concatenate(self._ticks) if self._ticks else np.empty((0, 1), TICK)
         self._events, self._ticks = [], []
         ticks = ticks[ticks["time_s"][:, 0] >= 0]
@@ -210,13 +207,6 @@ class Recording:
             strips = rr.LineStrips3D.columns(strips=_segments(ends_m[:-1], ends_m[1:]))
             self._columns(f"{root}/trails", times_s[-pieces:], strips.partition([place_m.shape[1]] * pieces))
 
-    def _send_events(self, events: list[Event]) -> None:
-        said = at_once(events)
-        times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
-        texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
-        levels = [_event_level(event) for event, _ in said]
-        self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
-
     def _log_scene_styles(self) -> None:
         colors, few = scene.vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
         own = [colors[k] for k in self._tree.followers]
@@ -246,7 +236,8 @@ class Recording:
         lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
         for path in _CURVES:
             lines(path, labels, colors)
-        lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [scene.dimmed(color) for color in colors], 0.8)
+        dimmed: list[Color] = [(r // 2 + 10, g // 2 + 10, b // 2 + 12) for r, g, b in colors]  # to the dark ground
+        lines("delay/rtt_ms", [f"{label} RTT" for label in labels], dimmed, 0.8)
         if self._predicts:
             lines("delay/assumed_ms", [f"{label} assumed" for label in labels], colors)
         lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
@@ -296,13 +287,6 @@ def _event_level(event: Event) -> str:
     return "WARN" if "CAUTION" in last else "INFO"
 
 
-def _margins_text(design: Design) -> str:
-    """The margins of a design, by model, as far as there are any."""
-    named = (("sampled", design.delay_margin_s), ("continuous", design.delay_margin_continuous_s))
-    known = [f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None]
-    return "; of the fastest gains " + ", ".join(known) if known else ""
-
-
 def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
     """The screen: the scene on the left, with modes and events; plots on the right; time below.
 
@@ -317,6 +301,9 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
         corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
         return rrb.TimeSeriesView(name=name, origin="/", contents=list(contents), plot_legend=corner, axis_x=whole)
 
+    named = (("sampled", design.delay_margin_s), ("continuous", design.delay_margin_continuous_s))
+    known = ", ".join(f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None)
+    margins = f"; of the fastest gains {known}" if known else ""
     few = len(scenario.vehicles) <= LEGEND_MAX
     events = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text has it, and times before 0
@@ -335,7 +322,7 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
             ),
             rrb.Vertical(
                 plot("Spacing errors [m]", "/spacing/**", legend=few),
-                plot(f"Loop delay, RTT (dim), margin (red{_margins_text(design)}) [ms]", "/delay/**"),
+                plot(f"Loop delay, RTT (dim), margin (red{margins}) [ms]", "/delay/**"),
                 plot("Headroom: 1 − loop delay / margin [%]", "/headroom/**"),
                 rrb.Tabs(
                     plot("Command north [m/s²]", "/command/north_m_s2"),
@@ -353,7 +340,9 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
 
 def _scene_view(root: str, scenario: Scenario) -> Any:
     """A 3D view from behind and above, far enough away to show the whole wanted formation."""
-    middle_m, reach_m = scene.wanted_extent_m(scenario)
+    place_m = plan_formation(scenario).place_ne_m()
+    lowest_m, highest_m = place_m.min(axis=0), place_m.max(axis=0)
+    middle_m, reach_m = (lowest_m + highest_m) / 2, (highest_m - lowest_m) / 2
     # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
     radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0
     if root == "formation":

@@ -320,28 +320,25 @@ def delay_text(summary: Summary) -> str:
     if summary.margin_unknown:
         margin = f"margin unknown: {summary.margin_unknown}"
     ranges = [vehicle.delay_margin_s for vehicle in summary.vehicles]
-    least_s, most_s = (
-        min((own.min or inf for own in ranges), default=inf),
-        max((own.max or 0.0 for own in ranges), default=0.0),
-    )
+    least_s = min((own.min or inf for own in ranges), default=inf)
+    most_s = max((own.max or 0.0 for own in ranges), default=0.0)
     if margin_s is not None and all(own.min == own.max for own in ranges) and least_s < most_s:
         margin = f"margin {ms_text(least_s, unit='')} to {ms_text(most_s)} by vehicle"
     elif margin_s is not None and most_s > margin_s:
         way = "slower gains" if summary.prediction == "off" else "prediction"
         margin += f", up to {ms_text(most_s)} with {way}"
-    bound_s, closest = summary.loop_delay_bound_s, summary.closest_to_margin
+    bound_s, whose = summary.loop_delay_bound_s, ""
+    known = [vehicle for vehicle in summary.vehicles if vehicle.headroom_min is not None]
+    if known:
+        closest = min(known, key=lambda vehicle: vehicle.headroom_min or 0.0)
+        left = "" if closest.headroom_min_s is None else f": {ms_text(closest.headroom_min_s)}"
+        whose = f" (vehicle {closest.system_id}{left})"
     over = " over all vehicles" if len(summary.vehicles) > 1 else ""
     error = "" if bound_s is None else f" (clocks: ± {ms_text(bound_s)})"
     return (
         f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max{over}{error}; "
-        f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}{'' if closest is None else _of(closest)}"
+        f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}{whose}"
     )
-
-
-def _of(closest: VehicleSummary) -> str:
-    """Whose headroom it is, and how much longer its loop delay could have been."""
-    left = "" if closest.headroom_min_s is None else f": {ms_text(closest.headroom_min_s)}"
-    return f" (vehicle {closest.system_id}{left})"
 
 
 def response_text(response: ResponsePart | None) -> str:

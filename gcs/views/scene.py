@@ -49,11 +49,6 @@ def vehicle_colors(count: int) -> list[Color]:
     return [(int(255 * red), int(255 * green), int(255 * blue)) for red, green, blue in colors]
 
 
-def dimmed(color: Color) -> Color:
-    """The same hue, half way to the dark ground."""
-    return (color[0] // 2 + 10, color[1] // 2 + 10, color[2] // 2 + 12)
-
-
 @dataclass(frozen=True)
 class Tree:
     """Who follows whom, as indices in the scenario's order."""
@@ -95,13 +90,6 @@ def tree_of(scenario: Scenario) -> Tree:
         offsets_m=place_m[followers] - place_m[fronts],
         places_m=None if motion is None else lambda time_s: with_down(motion.places_ne_m(time_s)),
     )
-
-
-def wanted_extent_m(scenario: Scenario) -> tuple[FloatArray, FloatArray]:
-    """Centre (north, east) of the wanted formation relative to the leader, and its half extents."""
-    place_m = plan_formation(scenario).place_ne_m()
-    lowest_m, highest_m = place_m.min(axis=0), place_m.max(axis=0)
-    return (lowest_m + highest_m) / 2, (highest_m - lowest_m) / 2
 
 
 class Newest:

@@ -174,28 +174,23 @@ class Figures:
     gain_set: int
     """The slowest that any vehicle is flown with."""
 
-    def worst_first(self) -> list[int]:
-        """Indices of vehicles: first those in the worst mode, within a mode those with the least headroom."""
-        headroom = np.nan_to_num(self.headroom, nan=np.inf)
-        return sorted(range(len(self.modes)), key=lambda k: (-_BADNESS.index(self.modes[k]), headroom[k], k))
-
-    def not_nominal(self) -> dict[Mode, list[int]]:
-        """Indices of the vehicles in each mode but NOMINAL, worst mode first."""
-        found = {mode: [k for k, own in enumerate(self.modes) if own == mode] for mode in reversed(_BADNESS)}
-        return {mode: indices for mode, indices in found.items() if indices and mode != Mode.NOMINAL}
-
 
 def render(state: FlightState, *, width: int, height: int) -> RenderableType:
     """The whole display, in at most `height` lines: as many vehicles as fit, and how many do not."""
-    figures = state.figures()
-    head: list[RenderableType] = [_headline(state), _progress(state, width)]
+    figures, duration_s = state.figures(), state.scenario.duration_s
+    done_s = min(max(np.nan_to_num(state.time_s), 0.0), duration_s)
+    bar = ProgressBar(total=duration_s, completed=done_s, width=max(width - 28, 10))
+    progress = Table.grid(padding=(0, 2))
+    progress.add_row(bar, f"{duration_s - done_s:.1f} s of {duration_s:.1f} s left")
     foot = _footer(state, figures)
     order = list(range(len(state.system_ids)))
-    room = max(height - len(head) - len(foot) - 4, 2)  # 4: two lines of headings, the rule below, an empty line
-    if len(order) > room:
-        order = sorted(figures.worst_first()[: room - 1])
-    table = _vehicles(state, figures, order, width)
-    return Group(*head, table, *not_shown(len(state.system_ids) - len(order)), Text(), *foot)
+    room = max(height - len(foot) - 6, 2)  # 6: two lines above the table, two of headings, the rule, an empty line
+    if len(order) > room:  # first those in the worst mode, within a mode those with the least headroom
+        headroom = np.nan_to_num(figures.headroom, nan=np.inf)
+        order.sort(key=lambda k: (-_BADNESS.index(figures.modes[k]), headroom[k]))
+        order = sorted(order[: room - 1])
+    table, hidden = _vehicles(state, figures, order, width), len(state.system_ids) - len(order)
+    return Group(_headline(state), progress, table, *not_shown(hidden), Text(), *foot)
 
 
 def _headline(state: FlightState) -> Text:
@@ -205,15 +200,6 @@ def _headline(state: FlightState) -> Text:
     margin = f"{ms_text(state.margin_s, '.0f', unit='')} ms ({loop} loop, fastest gains)"
     line.append(f"   delay margin {'unknown' if state.margin_unknown else margin}", style="dim")
     line.no_wrap = True
-    return line
-
-
-def _progress(state: FlightState, width: int) -> RenderableType:
-    duration_s = state.scenario.duration_s
-    done_s = min(max(np.nan_to_num(state.time_s), 0.0), duration_s)
-    bar = ProgressBar(total=duration_s, completed=done_s, width=max(width - 28, 10))
-    line = Table.grid(padding=(0, 2))
-    line.add_row(bar, f"{duration_s - done_s:.1f} s of {duration_s:.1f} s left")
     return line
 
 
@@ -243,7 +229,6 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
 
 
 def _footer(state: FlightState, figures: Figures) -> list[Text]:
-    """The formation in one line, then the newest events."""
     line = Text(f"least headroom {_worst_headroom(state, figures)}", no_wrap=True)
     line.append(f"   tick lateness p99 {ms_text(figures.lateness_s_p99, '.2f', unit='')} ms")
     if state.skipped:
@@ -258,11 +243,10 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
 
 
 def plain_line(state: FlightState) -> str:
-    figures = state.figures()
-    modes = [
-        f"{mode.name} {' '.join(str(state.system_ids[k]) for k in indices)}"
-        for mode, indices in figures.not_nominal().items()
-    ]
+    figures, modes = state.figures(), list[str]()
+    for mode in (mode for mode in reversed(_BADNESS) if mode != Mode.NOMINAL and mode in figures.modes):
+        own = [str(system_id) for system_id, now in zip(state.system_ids, figures.modes, strict=True) if now == mode]
+        modes.append(f"{mode.name} {' '.join(own)}")
     time, at_delay = time_text(state.time_s, state.before_s), state.at_delay(figures)
     return (
         f"{time}  spacing error max {number_text(_worst(figures.spacing_error_m), '.2f')} m"
@@ -349,6 +333,5 @@ def headroom_text(headroom: float | None, before: str = "") -> Text:
 
 
 def _bar(headroom: float) -> str:
-    """Headroom as a bar of ten cells."""
     eighths = int(np.clip(np.nan_to_num(headroom), 0, 1) * 80)
     return ("█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8]).ljust(10)[:10]

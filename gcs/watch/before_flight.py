@@ -16,8 +16,9 @@ from gcs.drive.udp import StationSocket, clock_ns
 from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.link import mavlink
+from gcs.plan.design import LinkPart
 from gcs.runs.record import SCENARIO_FILE
-from gcs.watch.for_link import MeasuredDelays, delays_of
+from gcs.watch.for_link import delays_of
 from gcs.watch.links import Requests, Watch
 from gcs.watch.live import watch_links
 from gcs.watch.saved_links import LinkRecorder
@@ -45,7 +46,7 @@ class _Measurement:
             self._complete_ns = now_ns
         return bool(self._complete_ns) and now_ns - self._complete_ns >= MEASURED_S * NS_PER_S
 
-    def delays(self, complaint: str = "") -> MeasuredDelays:
+    def delays(self, complaint: str = "") -> LinkPart:
         """The loop delays measured. Raises InputError if the links of any vehicle were not."""
         measured = self.recorder.measured
         if missing := [str(system_id) for system_id in self.watch.vehicles if system_id not in measured]:
@@ -57,7 +58,7 @@ class _Measurement:
 
 def measured_now(
     scenario: Scenario, link: StationSocket | None, *, start_vehicles: bool, key_file: Path | None, shown: bool
-) -> MeasuredDelays:
+) -> LinkPart:
     """The loop delays that the scenario would have over the links of the vehicles that send to this socket.
 
     With `start_vehicles` these are simulated ones, which end with the measurement. Without a socket, vehicles and links

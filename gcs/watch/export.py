@@ -7,7 +7,6 @@ first tick on the station's clock, those of a log since 1970.
 
 import csv
 import json
-import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gains.core.requirement import plain
 from gcs.control.tick import TickArray
 from gcs.link import mavlink
 from gcs.runs.files import RunTail, read_ticks
@@ -79,11 +79,7 @@ def _of_log(file: Path) -> Iterator[Message]:
 
 def _known(fields: dict[str, Any]) -> dict[str, Any]:
     """The fields without those that are None, NaN or infinite, for which JSON has no value."""
-    return {
-        name: value
-        for name, value in fields.items()
-        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
-    }
+    return {name: value for name, value in fields.items() if plain(value) is not None}
 
 
 def write_mcap(file: Path, messages: Sequence[Message]) -> None:

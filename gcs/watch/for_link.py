@@ -5,7 +5,7 @@ compared at the least and at the worst of these delays: gains without prediction
 median delay. Either keeps the wanted headroom at the worst delay.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 
@@ -38,63 +38,42 @@ LEAST_SHARE = 0.2
 delays will differ from those measured."""
 
 
-@dataclass(frozen=True)
-class MeasuredDelays:
-    """The loop delay of a scenario over measured links: the median of the slowest vehicle, and the spread about it."""
+def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> LinkPart:
+    """The loop delays that a scenario would have over links that were measured; `source` says when.
 
-    source: str
-    vehicles: tuple[int, ...]
-    least_s: float
-    median_s: float
-    worst_s: float
+    The median of the slowest vehicle, and about it from the 1st to the 99th percentile, the widest of any vehicle.
+    """
+    spreads: list[list[float]] = []
+    for system_id in recorder.measured:
+        profile = recorder.profile(source, only=system_id)
+        drawn_s = drawn_loop_delays_s(scenario, profile.up, profile.down)
+        spreads.append(np.percentile(drawn_s[np.isfinite(drawn_s)], [1.0, 50.0, 99.0]).tolist())
+    median_s = max(middle_s for _, middle_s, _ in spreads)
+    shorter_s = max(middle_s - low_s for low_s, middle_s, _ in spreads)
+    longer_s = max(high_s - middle_s for _, middle_s, high_s in spreads)
+    return LinkPart(
+        source=source,
+        vehicles=tuple(recorder.measured),
+        loop_delay_s_least=max(0.0, median_s - shorter_s),
+        loop_delay_s_p50=median_s,
+        loop_delay_s_worst=median_s + longer_s,
+        headroom=scenario.control.link_headroom,
+    )
 
 
-def measured_delays(run_or_file: Path, scenario: Scenario) -> MeasuredDelays:
-    """The loop delays that a scenario would have over the links in a run's folder or a telemetry log.
+def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario, LinkPart]:
+    """The scenario with the gains that are best for the links in a run's folder or a telemetry log, and why these.
 
-    Raises InputError if the log shows too little.
+    Raises InputError if the log shows too little, or no gains tolerate the delays.
     """
     log_file = found(run_or_file).log_file
     recorder = recorded(read_tlog(log_file).frames)
     if not recorder.measured:  # one line says what is missing
         recorder.profile(str(log_file), option=f"{OPTION}: {log_file}")
-    return delays_of(recorder, str(run_or_file), scenario)
+    return best_for(scenario, delays_of(recorder, str(run_or_file), scenario))
 
 
-def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> MeasuredDelays:
-    """The loop delays that a scenario would have over links that were measured; `source` says when.
-
-    From the 1st to the 99th percentile, the widest of any vehicle.
-    """
-    spreads: list[tuple[float, float, float]] = []
-    for system_id in recorder.measured:
-        profile = recorder.profile(source, only=system_id)
-        drawn_s = drawn_loop_delays_s(scenario, profile.up, profile.down)
-        low_s, middle_s, high_s = np.percentile(drawn_s[np.isfinite(drawn_s)], [1.0, 50.0, 99.0]).tolist()
-        spreads.append((low_s, middle_s, high_s))
-    median_s = max(middle_s for _, middle_s, _ in spreads)
-    shorter_s, longer_s = (
-        max(middle - low for low, middle, _ in spreads),
-        max(high - middle for _, middle, high in spreads),
-    )
-    return MeasuredDelays(
-        source=source,
-        vehicles=tuple(recorder.measured),
-        least_s=max(0.0, median_s - shorter_s),
-        median_s=median_s,
-        worst_s=median_s + longer_s,
-    )
-
-
-def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario, LinkPart]:
-    """The scenario with the gains that are best for measured links, and why these were chosen.
-
-    Raises InputError if the log shows too little, or no gains tolerate the delays.
-    """
-    return best_for(scenario, measured_delays(run_or_file, scenario))
-
-
-def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, LinkPart]:
+def best_for(scenario: Scenario, delays: LinkPart) -> tuple[Scenario, LinkPart]:
     """The scenario with the gains that are best for these delays, and why. Raises InputError if none tolerate them."""
     criteria = scenario.control.criteria
     aim: Aim = "alpha_at_delay"
@@ -105,22 +84,13 @@ def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, Link
     fit = [own for own in candidates if not own.refused]
     if not fit:
         reasons = "; ".join(f"{_name(own)}: {own.refused}" for own in candidates)
-        worst = f"a loop delay of {1e3 * delays.worst_s:.1f} ms"
+        worst = f"a loop delay of {1e3 * delays.loop_delay_s_worst:.1f} ms"
         raise InputError(f"control.for_link: read {worst} from {delays.source}, wanted one that gains take: {reasons}")
     best = max(fit, key=lambda own: getattr(own, figure))
     others = [own for own in candidates if own is not best]
     against = [own.refused or f"{getattr(own, figure):.4g} {_name(own)}" for own in others]
-    part = LinkPart(
-        source=delays.source,
-        vehicles=delays.vehicles,
-        loop_delay_s_least=delays.least_s,
-        loop_delay_s_p50=delays.median_s,
-        loop_delay_s_worst=delays.worst_s,
-        headroom=scenario.control.link_headroom,
-        maximised=figure,
-        chosen=f"{_name(best)}: {figure} {getattr(best, figure):.4g} at the worst delay, against {'; '.join(against)}",
-        candidates=candidates,
-    )
+    chosen = f"{_name(best)}: {figure} {getattr(best, figure):.4g} at the worst delay, against {'; '.join(against)}"
+    part = delays.model_copy(update={"maximised": figure, "chosen": chosen, "candidates": candidates})
     assert best.K1 is not None
     assert best.K2 is not None
     assert best.K3 is not None
@@ -132,19 +102,18 @@ def _name(own: GainsAtDelay) -> str:
     return "with prediction" if own.prediction else "without prediction"
 
 
-def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> GainsAtDelay:
-    """The best gains with or without prediction, and their figures."""
+def _candidate(scenario: Scenario, delays: LinkPart, aim: Aim, *, predicted: bool) -> GainsAtDelay:
     control, period_s, response = scenario.control, loop_timing(scenario).held_s, given_response(scenario)
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
-    middle_s, worst_s, spare = delays.median_s, delays.worst_s, 1.0 - control.link_headroom
-    around_s = max(worst_s - middle_s, middle_s - delays.least_s)
+    middle_s, spare = delays.loop_delay_s_p50, 1.0 - delays.headroom
+    ends_s = least_s, worst_s = delays.loop_delay_s_least, delays.loop_delay_s_worst
+    around_s = max(worst_s - middle_s, middle_s - least_s)
     window_s = max(around_s / spare, LEAST_SHARE * middle_s, period_s)
     if predicted:
         window = max(0.0, middle_s - window_s), middle_s + window_s
         criteria = replace(criteria, at_delay_s=middle_s, maximise=aim, delays_s=window, delay_rate=0.0)
     else:
         criteria = replace(criteria, at_delay_s=worst_s, maximise=aim)
-    ends_s = delays.least_s, worst_s
     if predicted and middle_s > PREDICTION_MAX_S:
         return GainsAtDelay(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
     try:

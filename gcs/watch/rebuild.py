@@ -10,7 +10,7 @@ the formation, so errors are relative to the formation as designed. Lateness is 
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import inf, nan
 from typing import NamedTuple
 
@@ -68,14 +68,6 @@ class _Outline(NamedTuple):
 
 _Commands = dict[int, tuple[int, Vector]]
 """By system id, when a set-point was sent, and its acceleration."""
-
-
-@dataclass
-class _OpenTick:
-    """A tick some of whose set-points have been read."""
-
-    key_ms: int
-    commands: _Commands = field(default_factory=dict[int, tuple[int, Vector]])
 
 
 def rebuild(frames: Frames, scenario: Scenario, design: Design) -> Rebuilt:
@@ -172,7 +164,8 @@ class _Rebuilding:
         half_ns = self._period_ns // 2
         self._own_ns = (outline.base_ns + first_key * 1_000_000 - half_ns, outline.base_ns + last_key * 1_000_000)
         self._grid_ns = self._newest_ns = 0
-        self._open: _OpenTick | None = None
+        self._key_ms, self._commands = 0, _Commands()
+        """The tick whose set-points are being read, and those read so far."""
         self._rows: list[TickArray] = []
         self._events: list[Event] = []
 
@@ -202,16 +195,14 @@ class _Rebuilding:
 
     def _set_point(self, time_ns: int, frame: mavlink.Frame) -> None:
         key_ms, command, target = frame.fields[0], frame.fields[7:9], frame.fields[13]
-        if self._open is None or self._open.key_ms != key_ms:
+        if key_ms != self._key_ms:
             self._close_tick()
-            self._open = _OpenTick(key_ms)
-        self._open.commands[target] = time_ns, command
+        self._key_ms, self._commands[target] = key_ms, (time_ns, command)
 
     def _close_tick(self) -> None:
-        if self._open is not None:
-            due_ns = self._outline.base_ns + self._open.key_ms * 1_000_000
-            self._tick(due_ns, self._open.commands, self._open.key_ms)
-            self._open = None
+        if self._commands:
+            self._tick(self._outline.base_ns + self._key_ms * 1_000_000, self._commands, self._key_ms)
+            self._commands = _Commands()
 
     def _look(self, time_ns: int) -> None:
         """Add the ticks without set-points: those before and after this station's, or all if another wrote the log."""
@@ -271,7 +262,6 @@ class _Rebuilding:
             self._reported[row] = boot_ms, down + origin_down, v_down, nan, time_ns, bound_s
 
     def _tick(self, due_ns: int, commands: _Commands, key_ms: int) -> None:
-        """The rows of one tick, from what the station knew when it sent these set-points."""
         sent_ns = max((own_ns for own_ns, _ in commands.values()), default=due_ns)
         time_s = (due_ns - self._start_ns) / NS_PER_S
         flying = bool(commands) and time_s >= 0

@@ -88,7 +88,11 @@ class LinkRecorder:
         up, down = (np.concatenate([getattr(own, name) for own in seen]) for name in ("up_s", "down_s"))
         each = max(1, round(len(up) / len(down)))
         lost, received = [run for own in seen for run in own.runs], sum(own.frames for own in seen)
-        loss = _loss(lost, received)
+        loss = None
+        if lost:  # Gilbert's model: its bursts have the mean length of the runs, and begin as often
+            # a burst lasts 1 / r datagrams; it begins after p of the good ones
+            to_bad, to_good = len(lost) / max(received, len(lost)), len(lost) / sum(lost)
+            loss = LossBursts(to_bad_probability=to_bad, to_good_probability=to_good)
         bound_s = max(own.bound_s for own in seen)
         return LinkProfile(
             source=source,
@@ -135,15 +139,6 @@ def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
     """A link that repeats these delays in their order."""
     trace = tuple(round(delay_s, 6) for delay_s in delays_s[:TRACE_DELAYS].tolist())
     return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss)
-
-
-def _loss(runs: list[int], received: int) -> LossBursts | None:
-    """Gilbert's model: its bursts have the mean length of the runs, and begin as often."""
-    if not runs:
-        return None
-    # a burst lasts 1 / r datagrams; it begins after p of the good ones
-    to_bad, to_good = len(runs) / max(received, len(runs)), len(runs) / sum(runs)
-    return LossBursts(to_bad_probability=to_bad, to_good_probability=to_good)
 
 
 def _latency(delays_s: FloatArray, bound_s: float, runs: list[int]) -> Latency:

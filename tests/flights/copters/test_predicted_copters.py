@@ -11,12 +11,13 @@ from gains.design.front import AIMS, Aim
 from gains.performance.response import formation_loop
 from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
+from gcs.plan.design import LinkPart
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.studies.front import compared, point_at
-from gcs.watch.for_link import MeasuredDelays, best_for
+from gcs.watch.for_link import best_for
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
 from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
@@ -102,7 +103,11 @@ def test_gains_for_a_delay_decay_in_flight_as_computed(aim: Aim, prediction: Lit
 
 def test_copters_take_the_gains_for_their_measured_link() -> None:
     asked = scenario("off", 0.2).model_copy(update={"control": Control(for_link="measured", link_headroom=0.3)})
-    chosen, why = best_for(asked, MeasuredDelays("a link", (1, 2, 3), 0.39, 0.41, 0.43))
+    delays = LinkPart(
+        source="a link", vehicles=(1, 2, 3), loop_delay_s_least=0.39, loop_delay_s_p50=0.41, loop_delay_s_worst=0.43,
+        headroom=0.3,
+    )  # fmt: skip
+    chosen, why = best_for(asked, delays)
     plain, predicted = why.candidates
     assert chosen.control.prediction == "measured"
     assert known(predicted.alpha) > 1.3 * known(plain.alpha)

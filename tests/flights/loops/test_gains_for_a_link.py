@@ -18,7 +18,7 @@ from gcs.stress.study import Study
 from gcs.studies.front import compared, point_at, searched_in
 from gcs.studies.virtual import fly_virtual
 from gcs.watch.before_flight import measured_now
-from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
+from gcs.watch.for_link import best_for, evaluated
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, load
 from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
@@ -163,9 +163,9 @@ def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> Non
     before = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
     assert before.vehicles == (1, 2, 3)
     flown_s = flown(CHAIN.model_copy(update={"links": links}).with_calm_monitor())[1].loop_delay_s
-    assert before.median_s == pytest.approx(known(flown_s.p50), abs=PERIOD_S / 2.0)
+    assert before.loop_delay_s_p50 == pytest.approx(known(flown_s.p50), abs=PERIOD_S / 2.0)
     # clocks are known within half a round trip only, but not its length: the spread is that of both ways together
-    assert before.worst_s - before.least_s == pytest.approx(2 * 0.03 + PERIOD_S, rel=0.25)
+    assert before.loop_delay_s_worst - before.loop_delay_s_least == pytest.approx(2 * 0.03 + PERIOD_S, rel=0.25)
 
 
 def test_links_that_cannot_be_measured_before_a_flight_are_refused() -> None:
@@ -178,10 +178,14 @@ def test_links_that_cannot_be_measured_before_a_flight_are_refused() -> None:
 
 def test_a_delay_that_nothing_takes_is_refused() -> None:
     """Margins are designed up to 30 s, and the station predicts over 10 s at most."""
+    delays = LinkPart(
+        source="log", vehicles=(1,), loop_delay_s_least=22.0, loop_delay_s_p50=23.0, loop_delay_s_worst=24.0,
+        headroom=0.3,
+    )  # fmt: skip
     with pytest.raises(
         InputError, match=r"control.for_link: read a loop delay of 24000.0 ms from log, wanted one that"
     ):
-        best_for(CHAIN, MeasuredDelays("log", (1,), least_s=22.0, median_s=23.0, worst_s=24.0))
+        best_for(CHAIN, delays)
 
 
 def static_decay_1_s(way: GainsAtDelay, first: float = 1.0, last: float = 1.0, *, share: float = 1.0) -> float:

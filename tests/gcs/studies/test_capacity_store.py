@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gcs.errors import InputError
-from gcs.studies.capacity import LOADS_FILE, LoadStore, capacity, fly_loaded
+from gcs.studies.capacity import LOADS_FILE, capacity, fly_loaded, loads_of, write_result
 from scenarios.files import load, with_loop
 from scenarios.schema import Scenario
 from tests.support.paths import SCENARIOS
@@ -33,23 +33,23 @@ def test_early_end_is_told_as_the_station_told_it(short: Scenario) -> None:
 
 
 def test_resumed_study_flies_nothing_again(tmp_path: Path, short: Scenario) -> None:
-    first = LoadStore(tmp_path, short, resume=False)
+    first = loads_of(tmp_path, short, resume=False)
     left: list[int] = []
-    found = capacity(short, rates_hz=[10.0], most=3, seeds=1, seconds=6.0, fly=first.fly, ended=left.append)
-    first.write_result(found)
+    found = capacity(short, rates_hz=[10.0], most=3, seeds=1, seconds=6.0, store=first, ended=left.append)
+    write_result(tmp_path, found)
     first.close()
     assert left == sorted(left, reverse=True)
     assert left[-1] == 0
     stored = (tmp_path / LOADS_FILE).read_bytes()
     (tmp_path / LOADS_FILE).write_bytes(stored + stored[:40])  # a kill cut the last line short
-    again = LoadStore(tmp_path, short, resume=True)
-    assert capacity(short, rates_hz=[10.0], most=3, seeds=1, seconds=6.0, fly=again.fly) == found
+    again = loads_of(tmp_path, short, resume=True)
+    assert capacity(short, rates_hz=[10.0], most=3, seeds=1, seconds=6.0, store=again) == found
     again.close()
     assert (tmp_path / LOADS_FILE).read_bytes() == stored + stored[:40] + b"\n"
     assert json.loads((tmp_path / "capacity.json").read_text())["schema_version"] == 1
 
 
 def test_study_of_another_scenario_is_not_resumed(tmp_path: Path, short: Scenario) -> None:
-    LoadStore(tmp_path, short, resume=False).close()
+    loads_of(tmp_path, short, resume=False).close()
     with pytest.raises(InputError, match="another scenario"):
-        LoadStore(tmp_path, short.model_copy(update={"seed": 99}), resume=True)
+        loads_of(tmp_path, short.model_copy(update={"seed": 99}), resume=True)
