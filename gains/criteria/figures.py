@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.structure import roots_of
 from gains.criteria.norms import noise_gain, peak_gain
-from gains.criteria.poles import pole_region, roots_of
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
@@ -21,6 +21,22 @@ from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import growth_rate, sampled_delay_margin
 from gains.sampled.onboard import own_part
 from gains.varying.jitter import spread_bound
+
+
+def pole_region(roots: ComplexArray) -> tuple[float, float]:
+    """Return the least damping ratio −Re s / |s| and the largest |s| (rad/s) of roots (k,). A root at zero has ratio 0.
+
+    Of a loop without delay: with delay it has infinitely many roots, with ratios down to zero far to the left, of which
+    only the rightmost one counts (`gains.performance.behaviour`).
+
+    s² + s + 1 has roots of magnitude 1 and ratio 1/2:
+
+    >>> [round(value, 9) for value in pole_region(roots_of(np.array([[0.0, 1.0], [-1.0, -1.0]])))]
+    [0.5, 1.0]
+    """
+    size = np.abs(roots)
+    ratios = np.where(size > 0.0, -roots.real / np.where(size > 0.0, size, 1.0), 0.0)
+    return float(ratios.min()), float(size.max())
 
 
 class FiguresAtOnce:

@@ -35,8 +35,7 @@ from typing import Self
 import numpy as np
 
 from gains.core._bracketing import Functions, highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.criteria.figures import FiguresAtOnce
 from gains.delay.rightmost import rightmost_root

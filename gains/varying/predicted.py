@@ -43,8 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import BoolArray, ComplexArray, FloatArray
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import seconds
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
