@@ -7,7 +7,6 @@ Source: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, w
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,21 +19,16 @@ Rank = tuple[float, float]
 """What a point is worth, less being better: how far it is from what must hold (0 if it holds), then its cost."""
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """The best point of a search, and its rank."""
+def best_of(
+    rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: float, evaluations: int
+) -> tuple[FloatArray, Rank]:
+    """Return the best point found from `start` (n,) and its rank.
 
-    point: FloatArray
-    rank: Rank
+    `step` is the standard deviation of the first draws along every axis. About as many points are looked at as
+    `evaluations` says, and fewer once steps are small.
 
-
-def best_of(rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: float, evaluations: int) -> Found:
-    """Return the best point found from `start` (n,) with about as many evaluations, and fewer once steps are small.
-
-    `step` is the standard deviation of the first draws along every axis.
-
-    >>> found = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
-    >>> (found.point**2).round(3).tolist()
+    >>> point, _ = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
+    >>> (point**2).round(3).tolist()
     [1.0, 0.0]
     """
     n = start.size
@@ -53,7 +47,7 @@ def best_of(rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: floa
     rng = np.random.default_rng(0)
     mean, covariance, sigma = start.astype(np.float64), np.eye(n), step
     path, sigma_path = np.zeros(n), np.zeros(n)
-    best = Found(mean, rank(mean))
+    best = mean, rank(mean)
     for turn in range(max(1, evaluations // population)):
         values, axes = np.linalg.eigh((covariance + covariance.T) / 2)
         lengths = np.sqrt(values.clip(min=1e-20))
@@ -63,8 +57,8 @@ def best_of(rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: floa
         points = mean + sigma * draws
         ranks = [rank(point) for point in points]
         order = sorted(range(population), key=lambda k: ranks[k])
-        if ranks[order[0]] < best.rank:
-            best = Found(points[order[0]], ranks[order[0]])
+        if ranks[order[0]] < best[1]:
+            best = points[order[0]], ranks[order[0]]
         chosen = draws[order[:parents]]
         shift = weights @ chosen
         mean = mean + sigma * shift

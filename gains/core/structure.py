@@ -16,7 +16,7 @@ from math import log2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray, IntArray, RealArray
+from gains.core.arrays import ComplexArray, FloatArray, IntArray, RealArray
 from gains.core.errors import BadModelError
 
 
@@ -121,6 +121,18 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
         Block(copies[key], tuple(matrix[np.ix_(indices, indices)].astype(np.float64) for matrix in matrices))
         for key, indices in first.items()
     ]
+
+
+def roots_of(A: FloatArray) -> ComplexArray:
+    """Return the eigenvalues of A (n, n), those of equal strongly connected blocks once.
+
+    Taken as a whole, equal followers would spoil each other's eigenvalues.
+
+    >>> roots_of(np.diag([-1.0, -1.0, -2.0])).real.tolist()
+    [-1.0, -2.0]
+    """
+    blocks = distinct_blocks(A)
+    return np.concatenate([np.linalg.eigvals(block.matrices[0]) for block in blocks]).astype(np.complex128)
 
 
 def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:

@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.structure import roots_of
 from gains.criteria.norms import noise_gain, peak_gain
-from gains.criteria.poles import pole_region, roots_of
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
@@ -23,8 +23,67 @@ from gains.sampled.onboard import own_part
 from gains.varying.jitter import spread_bound
 
 
+def pole_region(roots: ComplexArray) -> tuple[float, float]:
+    """Return the least damping ratio −Re s / |s| and the largest |s| (rad/s) of roots (k,). A root at zero has ratio 0.
+
+    Of a loop without delay: with delay it has infinitely many roots, with ratios down to zero far to the left, of which
+    only the rightmost one counts (`gains.performance.behaviour`).
+
+    s² + s + 1 has roots of magnitude 1 and ratio 1/2:
+
+    >>> [round(value, 9) for value in pole_region(roots_of(np.array([[0.0, 1.0], [-1.0, -1.0]])))]
+    [0.5, 1.0]
+    """
+    size = np.abs(roots)
+    ratios = np.where(size > 0.0, -roots.real / np.where(size > 0.0, size, 1.0), 0.0)
+    return float(ratios.min()), float(size.max())
+
+
+class FiguresAtOnce:
+    """What holds without any delay, with prediction and without; for dataclasses that have these fields."""
+
+    model: FormationModel
+    K: FloatArray
+    weight: tuple[float, float] | None
+    thinned: int
+
+    @cached_property
+    def closed_loop(self) -> FloatArray:
+        return self.model.A + self.model.B @ self.K
+
+    @cached_property
+    def decay_rate_1_s(self) -> float:
+        """−Re of the rightmost root without delay."""
+        return -float(self._roots.real.max())
+
+    @cached_property
+    def alpha(self) -> float:
+        """α without delay."""
+        return disturbance_bound(self.closed_loop, self.W)
+
+    @property
+    def damping_min(self) -> float:
+        """Least damping ratio of a root without delay."""
+        return pole_region(self._roots)[0]
+
+    @property
+    def natural_frequency_max_rad_s(self) -> float:
+        """Largest natural frequency of a root without delay."""
+        return pole_region(self._roots)[1]
+
+    @cached_property
+    def _roots(self) -> ComplexArray:
+        return roots_of(self.closed_loop)
+
+    @property
+    def W(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """Diagonal matrix of the weights of the states."""
+        spacing, velocity = self.weight or (1.0, 1.0)
+        return np.diag(np.where(self.model.spacing_mask, spacing, velocity))
+
+
 @dataclass(frozen=True, eq=False)
-class LoopFigures:
+class LoopFigures(FiguresAtOnce):
     """What a formation of one axis is good for with a gain K (inputs, states) of u = K e, each figure when it is read.
 
     Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` is
@@ -53,30 +112,6 @@ class LoopFigures:
     def exact(self) -> Self:
         """The same figures, none of them rough."""
         return replace(self, thinned=1)
-
-    @cached_property
-    def closed_loop(self) -> FloatArray:
-        return self.model.A + self.model.B @ self.K
-
-    @cached_property
-    def decay_rate_1_s(self) -> float:
-        """−Re of the rightmost root without delay."""
-        return -float(self._roots.real.max())
-
-    @cached_property
-    def alpha(self) -> float:
-        """α without delay."""
-        return disturbance_bound(self.closed_loop, self.W)
-
-    @property
-    def damping_min(self) -> float:
-        """Least damping ratio of a root without delay."""
-        return pole_region(self._roots)[0]
-
-    @property
-    def natural_frequency_max_rad_s(self) -> float:
-        """Largest natural frequency of a root without delay."""
-        return pole_region(self._roots)[1]
 
     @cached_property
     def delay_margin_s(self) -> float:
@@ -155,16 +190,6 @@ class LoopFigures:
             return spread_bound(A, late, mean_s=middle_s, rate=rate, scaled=exact)
         start_s, end_s = analyse_delay(A, late).window_around(middle_s) or (middle_s, middle_s)
         return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
-
-    @cached_property
-    def _roots(self) -> ComplexArray:
-        return roots_of(self.closed_loop)
-
-    @property
-    def W(self) -> FloatArray:  # noqa: N802 - the source's letter
-        """Diagonal matrix of the weights of the states."""
-        spacing, velocity = self.weight or (1.0, 1.0)
-        return np.diag(np.where(self.model.spacing_mask, spacing, velocity))
 
     @cached_property
     def _flown(self) -> FlownFormation:

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gains.core._bracketing import highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.sampled._loop import HeldPlant, lifted_map, settled_covariance
 
 

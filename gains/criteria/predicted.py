@@ -35,13 +35,11 @@ from typing import Self
 import numpy as np
 
 from gains.core._bracketing import Functions, highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
-from gains.criteria.figures import LoopFigures
+from gains.criteria.figures import FiguresAtOnce
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
-from gains.performance.flown import FlownTiming
 from gains.performance.response import Response, formation_loop
 from gains.sampled._loop import HeldPlant, held_entry, radius_of, rate_of
 from gains.sampled.multirate import Timing
@@ -70,7 +68,7 @@ def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArra
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedFigures:
+class PredictedFigures(FiguresAtOnce):
     """What a formation of one axis is good for with a gain K, predicted over `assumed_s`; without prediction it is 0.
 
     Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles answer at once if they have no
@@ -101,30 +99,6 @@ class PredictedFigures:
     @property
     def exact(self) -> Self:
         return replace(self, thinned=1)
-
-    @cached_property
-    def at_once(self) -> LoopFigures:
-        """Those without prediction, of which only what holds without any delay is read."""
-        timing = FlownTiming(inf, self.period_s)
-        return LoopFigures(self.model, self.K, timing, None, self.weight, thinned=self.thinned)
-
-    @property
-    def decay_rate_1_s(self) -> float:
-        """Without delay; the same at every delay without mismatch."""
-        return self.at_once.decay_rate_1_s
-
-    @property
-    def alpha(self) -> float:
-        """Without delay; as the next three."""
-        return self.at_once.alpha
-
-    @property
-    def damping_min(self) -> float:
-        return self.at_once.damping_min
-
-    @property
-    def natural_frequency_max_rad_s(self) -> float:
-        return self.at_once.natural_frequency_max_rad_s
 
     @property
     def delay_margin_s(self) -> float:
@@ -175,7 +149,7 @@ class PredictedFigures:
     @cached_property
     def alpha_at_delay(self) -> float:
         """The complex stability radius, as of `gains.performance.flown`; 0 if the loop is unstable."""
-        heavy, states = self.at_once.W, np.eye(self.model.states)
+        heavy, states = self.W, np.eye(self.model.states)
         return 1.0 / gain if (gain := self._peak(heavy, states)) < inf else 0.0
 
     @cached_property

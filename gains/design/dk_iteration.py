@@ -24,7 +24,7 @@ from scipy import linalg
 from gains.core._semidefinite import SolverFacts, solved
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
-from gains.criteria.poles import roots_of
+from gains.core.structure import roots_of
 from gains.formation.pattern import Pattern, Plant, check_fits
 
 # At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.

@@ -336,12 +336,12 @@ def _best(
         return short, cost(figures) if short == 0.0 else inf
 
     for turn in count(1):
-        found = best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations or enough)
+        point, reached = best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations or enough)
         for finer in _FINER if evaluations is None and starts[0].size > _FEW else ():
-            found = best_of(rank, found.point, step=family.step / finer, evaluations=enough)
-        exact = family.figures(found.point).exact
-        if turn == _AIMS or found.rank[0] > 0.0 or _meets(exact, parts):
-            return found.point, exact
+            point, reached = best_of(rank, point, step=family.step / finer, evaluations=enough)
+        exact = family.figures(point).exact
+        if turn == _AIMS or reached[0] > 0.0 or _meets(exact, parts):
+            return point, exact
         aims = [aim.tightened(part.shortfall(exact)) for aim, part in zip(aims, parts, strict=True)]
     raise AssertionError
 

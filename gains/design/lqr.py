@@ -12,37 +12,31 @@ Control 15 (1970), 44-48, for the gradient.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import linalg
 
 from gains.core.arrays import BoolArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, InfeasibleError
-from gains.core.structure import real_matrix, strongly_connected_blocks
+from gains.core.structure import strongly_connected_blocks
 from gains.formation.pattern import Plant
 
 
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """Weights of the cost: Q (n, n) on states and R (inputs, inputs).
-
-    BadModelError if a weight is not symmetric, Q not positive semidefinite, or R not positive definite.
-    """
+class Weights(NamedTuple):
+    """Weights of the cost, symmetric: Q (n, n) on states, positive semidefinite, and R (inputs, inputs), definite."""
 
     Q: FloatArray
     R: FloatArray
 
-    def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
-        object.__setattr__(self, "Q", _checked_weight("Q", Q, definite=False))
-        object.__setattr__(self, "R", _checked_weight("R", R, definite=True))
-
     def check_fits(self, plant: Plant) -> None:
-        """Raise BadModelError unless the sizes are those of the plant."""
-        if len(self.Q) != plant.states:
-            raise BadModelError(f"Q has shape {self.Q.shape}; {plant.A.shape} is wanted, as A")
-        if len(self.R) != plant.B.shape[1]:
-            raise BadModelError(f"R has shape {self.R.shape}; one row for each of {plant.B.shape[1]} inputs is wanted")
+        """Raise BadModelError unless the weights are as above and of the plant's size."""
+        for name, weight, size in (("Q", self.Q, plant.states), ("R", self.R, plant.B.shape[1])):
+            least, wanted = (-1e-12, "semidefinite") if name == "Q" else (1e-14, "definite")
+            symmetric = weight.shape == (size, size) and np.allclose(weight, weight.T, rtol=1e-12, atol=0.0)
+            if not symmetric or np.linalg.eigvalsh(weight)[0] < least * max(np.abs(weight).max(), 1e-300):
+                wanted = f"a symmetric, positive {wanted} matrix of {size} rows is wanted"
+                raise BadModelError(f"{name}, of shape {weight.shape}, does not fit: {wanted}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +146,8 @@ class Cost:
 def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
     """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
 
-    InfeasibleError if the Riccati equation has no stabilising solution.
+    Raises BadModelError if a weight is not what is wanted, and InfeasibleError if the Riccati equation has no
+    stabilising solution.
 
     >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
     >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1)))
@@ -168,14 +163,3 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
             "every mode on the imaginary axis"
         ) from error
     return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.trace(P))
-
-
-def _checked_weight(name: str, value: ArrayLike, *, definite: bool) -> FloatArray:
-    matrix = real_matrix(name, value)
-    if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
-        raise BadModelError(f"{name} is not symmetric; a symmetric matrix is wanted")
-    least, largest = float(np.linalg.eigvalsh(matrix)[0]), float(np.abs(matrix).max())
-    if least < -1e-12 * largest or (definite and least <= 1e-14 * largest):
-        wanted = "positive definite" if definite else "positive semidefinite"
-        raise BadModelError(f"{name} has the eigenvalue {least:.3g}; a {wanted} matrix is wanted")
-    return matrix

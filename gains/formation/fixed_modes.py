@@ -1,38 +1,28 @@
 """Modes that no gain with a given information pattern can move, and the links that would free them.
 
 λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
-pattern. If it lies in the closed right half plane, no such gain stabilises the plant. Two methods must agree on it, for
-one strongly connected component of plant and pattern at a time: random gains, and a rank. λ is fixed if and only if
-the inputs can be split into two sets D and E such that, with C_E the outputs that the inputs in E use,
+pattern. If it lies in the closed right half plane, no such gain stabilises the plant. A mode that random gains do not
+move is fixed: the gains that leave a free one where it is have measure zero. Each strongly connected component of plant
+and pattern is looked at by itself.
 
-    rank [[A − λI, B_D], [C_E, 0]] < n                                                              (1)
-
-Sources: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
-is a station; B. D. O. Anderson and D. J. Clements, "Algebraic characterization of fixed modes in decentralized
-control", Automatica 17 (1981), 703-712, for (1).
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
+is a station.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from gains.core.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from gains.core.errors import DisagreementError, InfeasibleError
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.errors import InfeasibleError
 from gains.core.structure import distinct_blocks, strongly_connected_blocks
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
 
-# with up to this many inputs in one component all subsets are tried (256 ranks), with more Wolfe's algorithm
-LARGEST_EXHAUSTIVE = 8
 # singular values below this share of the largest are zero: rounding is 1e-15, and what a gain moves is far larger
 _RANK_TOLERANCE = 1e-10
 # eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
 _SAME_EIGENVALUE = 1e-5
 _RANDOM_GAINS = 3
-# rounds of Wolfe's algorithm
-_ROUNDS = 1000
-
-SetFunction = Callable[[frozenset[int]], int]
 
 
 @dataclass(frozen=True)
@@ -53,23 +43,11 @@ class FixedMode:
         return self.mode.real > -1e-9 * max(1.0, abs(self.mode))
 
 
-@dataclass(frozen=True, eq=False)
-class _Component:
-    """One diagonal block of the closed loop: the inputs that act on it and, for each, the rows of C it uses."""
-
-    states: IntArray
-    A: FloatArray
-    B: tuple[FloatArray, ...]
-    C: FloatArray
-    rows: tuple[BoolArray, ...]
-
-
 def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
     """Every mode that no gain with the pattern moves, in ascending order of real part.
 
     The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` is that
-    of the random gains. Raises BadModelError if plant and pattern do not fit, and DisagreementError if the two methods
-    contradict each other: λ is nearly fixed.
+    of the random gains. Raises BadModelError if plant and pattern do not fit.
 
     A leader that may not use its own velocity error keeps its integrator, unless a link is added:
 
@@ -84,10 +62,13 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     check_fits(plant, pattern)
     gains = _random_gains(plant, pattern, seed)
     feedbacks = [plant.B @ gain @ plant.C for gain in gains]
+    linked = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
     found: dict[complex, set[int]] = {}
-    for component in _components(plant, pattern):
-        for mode in _fixed_in(component, feedbacks):
-            found.setdefault(mode, set()).update(component.states.tolist())
+    for states in strongly_connected_blocks(plant.A, linked):
+        own = np.ix_(states, states)
+        for mode in _candidates(plant.A[own]):
+            if all(_is_eigenvalue(plant.A[own] + feedback[own], mode) for feedback in feedbacks):
+                found.setdefault(mode, set()).update(states.tolist())
     return tuple(
         FixedMode(mode, tuple(sorted(states)), _remedies(plant, pattern, mode, gains[0]))
         for mode, states in sorted(found.items(), key=lambda item: (item[0].real, item[0].imag))
@@ -109,64 +90,6 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
             f"{_advice(worst.remedies)}"
         )
     return modes
-
-
-def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
-    feedback = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
-    found: list[_Component] = []
-    for states in strongly_connected_blocks(plant.A, feedback):
-        B = [plant.B[states, pattern.input_slice(i)] for i in range(len(pattern.input_sizes))]
-        C = plant.C[:, states]
-        inputs = [i for i, block in enumerate(B) if block.any()]
-        rows = tuple(np.repeat(pattern.blocks[i], pattern.output_sizes) & C.any(axis=1) for i in inputs)
-        found.append(_Component(states, plant.A[np.ix_(states, states)], tuple(B[i] for i in inputs), C, rows))
-    return found
-
-
-def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[complex]:
-    at = np.ix_(component.states, component.states)
-    fixed: list[complex] = []
-    for mode in _candidates(component.A):
-        stays = all(_is_eigenvalue(component.A + feedback[at], mode) for feedback in feedbacks)
-        rank = _least_rank(component, mode)
-        if stays != (rank < component.states.size):
-            raise DisagreementError(
-                f"mode {_number(mode)} of the states {component.states.tolist()}: by rank ({rank} of "
-                f"{component.states.size}) it is {'' if rank < component.states.size else 'not '}fixed, random gains "
-                f"{'do not ' if stays else ''}move it; scale the plant so that its entries are of like size"
-            )
-        if stays:
-            fixed.append(mode)
-    return fixed
-
-
-def _least_rank(component: _Component, mode: complex) -> int:
-    """Least rank of (1) over all D."""
-    n = component.states.size
-    shifted = component.A - mode * np.eye(n)
-    left, singular, right = np.linalg.svd(shifted)
-    kept = int(np.count_nonzero(singular > _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
-    # eliminating the regular part of A − λI once leaves a small matrix for every D:
-    # rank (1) = rank(A − λI) + rank [[0, M B_D], [C_E N, −C_E (A − λI)⁺ B_D]]
-    inverse = (right[:kept].conj().T / singular[:kept]) @ left[:, :kept].conj().T
-    M, N = left[:, kept:].conj().T, right[kept:].conj().T
-    B = [block * (_size(shifted) / _size(block)) for block in component.B]
-    C = component.C * (_size(shifted) / _size(component.C))
-    moved, through = [M @ block for block in B], [-C @ inverse @ block for block in B]
-    seen = C @ N
-
-    def rank(cut: frozenset[int]) -> int:
-        others = [rows for k, rows in enumerate(component.rows) if k not in cut]
-        rows = np.any(others, axis=0) if others else np.zeros(C.shape[0], dtype=bool)
-        acting = sorted(cut)
-        below = np.hstack([seen[rows], *(through[k][rows] for k in acting)])
-        above = np.hstack([np.zeros((n - kept, n - kept)), *(moved[k] for k in acting)])
-        return kept + _rank(np.vstack([above, below]), _size(shifted))
-
-    size = len(component.B)
-    if size > LARGEST_EXHAUSTIVE:
-        return _least_submodular(rank, size)
-    return min(rank(frozenset(k for k in range(size) if code >> k & 1)) for code in range(2**size))
 
 
 def _candidates(A: FloatArray) -> list[complex]:
@@ -241,15 +164,15 @@ def _links_that_help(
     return nullity, sorted(helpful, key=lambda entry: (abs(entry[0][0] - entry[0][1]), entry[0]))
 
 
-def _rank(matrix: FloatArray | ComplexArray, scale: float = 1.0) -> int:
-    """Rank of a matrix whose entries are either rounding or of the order of the scale."""
+def _rank(matrix: FloatArray | ComplexArray) -> int:
+    """Rank of a matrix whose entries are either rounding or of the order of one."""
     if matrix.size == 0:
         return 0
     singular = np.linalg.svd(matrix, compute_uv=False)
-    return int(np.count_nonzero(singular > _RANK_TOLERANCE * max(scale, float(singular[0]))))
+    return int(np.count_nonzero(singular > _RANK_TOLERANCE * max(1.0, float(singular[0]))))
 
 
-def _size(matrix: FloatArray | ComplexArray) -> float:
+def _size(matrix: FloatArray) -> float:
     """Largest absolute entry, or 1 if there is none: a scale to divide by."""
     largest = float(np.abs(matrix).max()) if matrix.size else 0.0
     return largest if largest > 0.0 else 1.0
@@ -265,43 +188,3 @@ def _advice(remedies: tuple[tuple[Link, ...], ...]) -> str:
 
 def _number(mode: complex) -> str:
     return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"
-
-
-def _least_submodular(value_of: SetFunction, size: int) -> int:
-    """The least value of an integer submodular function of subsets of range(size).
-
-    A rank is submodular: a column raises the rank of a set by no more than that of any of its subsets. Wolfe's
-    algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every x on the way proves the lower
-    bound f(∅) + Σ min(x_k, 0), and every set on the way gives an upper bound. Values are integers, so a gap below one
-    closes; a rank that rounding decides need not be submodular. (S. Fujishige, Submodular Functions and Optimization,
-    2nd ed. 2005, section 7.1.)
-    """
-    from scipy.optimize import nnls  # takes longer to import than small patterns to analyse
-
-    best = empty = value_of(frozenset())
-
-    def vertex(x: FloatArray) -> FloatArray:
-        """The vertex of the base polytope least in the direction x (Edmonds' greedy algorithm)."""
-        nonlocal best
-        point, subset, value = np.zeros(size), frozenset[int](), empty
-        for k in np.argsort(x, kind="stable").tolist():
-            subset |= {k}
-            next_value = value_of(subset)
-            point[k], value = next_value - value, next_value
-            best = min(best, value)
-        return point
-
-    points = vertex(np.zeros(size))[np.newaxis]
-    weights = np.ones(1)
-    for _ in range(_ROUNDS):
-        x = weights @ points
-        if empty + np.minimum(x, 0.0).sum() > best - 1 + 1e-6:
-            return best
-        points = np.vstack([points, vertex(x)])
-        # the point of least norm in the hull of the points, as a problem of nonnegative least squares
-        weights = nnls(np.vstack([points.T, np.ones(len(points))]), np.append(np.zeros(size), 1.0))[0]
-        points, weights = points[weights > 0.0], weights[weights > 0.0] / weights.sum()
-    raise DisagreementError(
-        f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best}; the ranks are "
-        "decided by rounding: scale the plant so that its entries are of like size"
-    )

@@ -20,8 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gains.core._bracketing import highest, met_end
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains

@@ -23,8 +23,7 @@ from math import inf, pi, tau
 import numpy as np
 
 from gains.core._bracketing import Functions, highest, peaks
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.performance.disturbed import DisturbedFormation
 from gains.sampled._loop import HeldPlant

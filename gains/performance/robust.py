@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core._norms import spectral_norms
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, spectral_norms
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix
 from gains.formation.model import FormationModel

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 
 Gains = tuple[FloatArray, FloatArray, FloatArray]

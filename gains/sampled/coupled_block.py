@@ -8,7 +8,6 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
-from typing import Protocol
 
 import numpy as np
 from numpy.linalg import pinv
@@ -22,95 +21,21 @@ from gains.formation.model import FormationModel
 from gains.sampled._extrapolated import ExtrapolatedLoop, extrapolated_loop
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
+from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop, streamed_loop
 from gains.sampled.prediction import checked_mask, mismatch_window, mismatch_window_continuous, predicted_growth_rate
 
 _SHIFT_1_S = 1e-6
 """Roots count as unstable right of this: those at zero of the formation's position, which nothing controls, do not."""
 
 
-class ClosedLoop(Protocol):
-    """The feedback within one block as it is flown: who closes it and what is predicted is chosen when it is made."""
-
-    def window_s(self) -> tuple[float, float]:
-        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
-        ...
-
-    def window_continuous_s(self) -> tuple[float, float]:
-        """The same of the continuous model; the hold counts as half a period."""
-        ...
-
-    def growth_1_s(self, delay_s: float) -> float:
-        """Growth rate (1/s) of the sampled and held loop at a loop delay."""
-        ...
-
-    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        """Of the continuous model: what acts after delays that are known (s), and what acts a loop delay late."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class GroundLoop:
-    """A station closes every loop: all feedback is late."""
-
-    A: FloatArray
-    B: FloatArray
-    K: FloatArray
-    timing: Timing
-
-    def window_s(self) -> tuple[float, float]:
-        return 0.0, multirate_delay_margin(self.A, self.B, self.K, self.timing)
-
-    def window_continuous_s(self) -> tuple[float, float]:
-        return 0.0, delay_margin(self.A, self.B @ self.K) - self.timing.held_s / 2.0
-
-    def growth_1_s(self, delay_s: float) -> float:
-        return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
-
-    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        return [(self.A, 0.0)], self.B @ self.K
-
-
-@dataclass(frozen=True, eq=False)
-class PredictedLoop:
-    """A station predicts over `assumed_s`; `measured` as in `gains.sampled.prediction`."""
-
-    A: FloatArray
-    B: FloatArray
-    K: FloatArray
-    timing: Timing
-    assumed_s: float
-    measured: Sequence[bool] | None = None
-
-    def window_s(self) -> tuple[float, float]:
-        loop = self.A, self.B, self.K, self.timing
-        return mismatch_window(*loop, assumed_s=self.assumed_s, measured=self.measured)
-
-    def window_continuous_s(self) -> tuple[float, float]:
-        half_s = self.timing.held_s / 2.0
-        loop, assumed_s = (self.A, self.B, self.K), self.assumed_s + half_s
-        least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=self.measured)
-        return max(0.0, least_s - half_s), most_s - half_s
-
-    def growth_1_s(self, delay_s: float) -> float:
-        loop = self.A, self.B, self.K, self.timing
-        return predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s, measured=self.measured)
-
-    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        assumed_s = self.assumed_s + self.timing.held_s / 2.0
-        loop = self.A, self.B, self.K
-        plant = HeldPlant(*loop, self.timing.held_s, checked_mask(loop, self.measured))
-        late = self.B @ (self.K @ plant.carry(np.array([assumed_s]))[0])
-        return [(self.A + self.B @ self.K, 0.0), (-late, assumed_s)], late
-
-
 @dataclass(frozen=True, eq=False)
 class CoupledBlock:
     """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
 
-    `system_ids` names the vehicles and `loop` is their feedback; `assumed_s` is the loop delay over which the station
-    predicts, None without prediction. `extrapolated` is the same loop with a state of each age, for vehicles that
-    share a loop which the station closes without prediction.
+    `system_ids` names the vehicles. `onboard` is the loop that they close on board, None where a station closes every
+    loop: all feedback is then late. `assumed_s` is the loop delay over which the station predicts, None without
+    prediction, and `measured` as in `gains.sampled.prediction`. `extrapolated` is the same loop with a state of each
+    age, for vehicles that share a loop which the station closes without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -118,18 +43,48 @@ class CoupledBlock:
     B: FloatArray
     K: FloatArray
     timing: Timing
-    loop: ClosedLoop
+    onboard: OnboardLoop | None = None
     assumed_s: float | None = None
+    measured: Sequence[bool] | None = None
     extrapolated: ExtrapolatedLoop | None = None
 
     @property
     def has_late_terms(self) -> bool:
         """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
-        return bool(self.loop.continuous_terms()[1].any())
+        return bool(self._continuous_terms()[1].any())
 
     def margin_s(self) -> float:
         """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""
-        return self.loop.window_s()[1]
+        return self.window_s()[1]
+
+    def window_s(self) -> tuple[float, float]:
+        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
+        if self.onboard is not None:
+            return 0.0, self.onboard.sampled_margin_s()
+        loop = self.A, self.B, self.K, self.timing
+        if self.assumed_s is None:
+            return 0.0, multirate_delay_margin(*loop)
+        return mismatch_window(*loop, assumed_s=self.assumed_s, measured=self.measured)
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        """The same of the continuous model; the hold counts as half a period."""
+        half_s = self.timing.held_s / 2.0
+        if self.onboard is not None:
+            return 0.0, self.onboard.continuous_margin_s() - half_s
+        if self.assumed_s is None:
+            return 0.0, delay_margin(self.A, self.B @ self.K) - half_s
+        loop, assumed_s = (self.A, self.B, self.K), self.assumed_s + half_s
+        least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=self.measured)
+        return max(0.0, least_s - half_s), most_s - half_s
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Growth rate (1/s) of the sampled and held loop at a loop delay."""
+        if self.onboard is not None:
+            return self.onboard.growth_1_s(delay_s)
+        loop = self.A, self.B, self.K, self.timing
+        if self.assumed_s is None:
+            return multirate_growth_rate(*loop, delay_s=delay_s)
+        return predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s, measured=self.measured)
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
         """Real part (1/s) of the rightmost root of the continuous model; the hold counts as half a period of delay."""
@@ -169,13 +124,24 @@ class CoupledBlock:
     @cached_property
     def _hold_s(self) -> float:
         """The delay (s) that stands for the hold: with it the continuous model has the sampled margin."""
-        continuous_s, sampled_s = self.loop.window_continuous_s()[1], self.margin_s()
+        continuous_s, sampled_s = self.window_continuous_s()[1], self.margin_s()
         shorter_s = continuous_s - sampled_s if isfinite(continuous_s - sampled_s) else 0.0
         return self.timing.held_s / 2.0 + shorter_s
 
+    def _continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        """Of the continuous model: what acts after delays that are known (s), and what acts a loop delay late."""
+        if self.onboard is not None:
+            return self.onboard.continuous_terms()
+        if self.assumed_s is None:
+            return [(self.A, 0.0)], self.B @ self.K
+        assumed_s, loop = self.assumed_s + self.timing.held_s / 2.0, (self.A, self.B, self.K)
+        plant = HeldPlant(*loop, self.timing.held_s, checked_mask(loop, self.measured))
+        late = self.B @ (self.K @ plant.carry(np.array([assumed_s]))[0])
+        return [(self.A + self.B @ self.K, 0.0), (-late, assumed_s)], late
+
     def _terms(self, delays_s: Sequence[float]) -> list[tuple[FloatArray, float]]:
         """Pairs (A, d) of the continuous model with a delay (s) for the command of each vehicle."""
-        known, late = self.loop.continuous_terms()
+        known, late = self._continuous_terms()
         entries, commands = (
             np.split(part, len(delays_s), axis) for part, axis in ((self.B, 1), (pinv(self.B) @ late, 0))
         )
@@ -191,7 +157,7 @@ class CoupledBlock:
         delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
         ages_s = {(age_s or {}).get(system_id) for system_id in self.system_ids}
         mean_s = sum(delays_s) / len(delays_s)
-        rate_1_s = self.loop.growth_1_s(mean_s)
+        rate_1_s = self.growth_1_s(mean_s)
         if max(delays_s) == min(delays_s) and len(ages_s) == 1:
             return rate_1_s
         differing_1_s = self.growth_continuous_at_1_s(loop_delay_s, age_s)
@@ -238,15 +204,17 @@ def coupled_blocks(
         own = np.concatenate([errors, *(np.r_[response_states[i]] for i in members if response_states)])
         inputs = np.concatenate([np.r_[model.input_slice(i)] for i in members])
         matrices = A[np.ix_(own, own)], B[np.ix_(own, inputs)], gain[np.ix_(inputs, own)]
-        loop: ClosedLoop = GroundLoop(*matrices, timing)
-        if whole is not None:
-            loop = whole.part(own)
-        elif assumed_s is not None:
-            loop = PredictedLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
-        shared = len(members) > 1 and isinstance(loop, GroundLoop)
-        of_positions = extrapolated_loop(model, members, *matrices) if shared else None
-        ids = tuple(system_ids[i] for i in members)
-        blocks.append(CoupledBlock(ids, *matrices, timing, loop, assumed_s, of_positions))
+        by_station = whole is None and assumed_s is None
+        block = CoupledBlock(
+            tuple(system_ids[i] for i in members),
+            *matrices,
+            timing,
+            None if whole is None else whole.part(own),
+            assumed_s,
+            None if assumed_s is None else [state < model.states for state in own.tolist()],
+            extrapolated_loop(model, members, *matrices) if len(members) > 1 and by_station else None,
+        )
+        blocks.append(block)
     return blocks
 
 

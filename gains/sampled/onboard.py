@@ -109,18 +109,12 @@ class OnboardLoop:
             return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
         return lifted_margin(plants, rates, near_s=continuous_s)
 
-    # as of `gains.sampled.coupled_block.ClosedLoop`
-
     def growth_1_s(self, delay_s: float) -> float:
+        """Growth rate (1/s) of the loop as flown at a loop delay."""
         return lifted_growth(self.plants(), self.timing.rates, delay_s=delay_s)
 
-    def window_s(self) -> tuple[float, float]:
-        return 0.0, self.sampled_margin_s()
-
-    def window_continuous_s(self) -> tuple[float, float]:
-        return 0.0, self.continuous_margin_s() - self.timing.rates.held_s / 2.0
-
     def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        """What acts after delays that are known (s), and what acts tau late."""
         own_s = self.timing.control_s / self.timing.steps / 2.0  # a hold counts as half a step
         return [(self.A, 0.0), (self.sensed + self.known, own_s)], self.late
 

@@ -13,9 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core._norms import spectral_norms
 from gains.core._semidefinite import Unknown, positive_definite_solution
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, seconds, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency

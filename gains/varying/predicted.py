@@ -43,8 +43,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import highest
-from gains.core._norms import spectral_norms
-from gains.core.arrays import BoolArray, ComplexArray, FloatArray
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import seconds
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
@@ -100,61 +99,56 @@ class PredictedSpread:
         apart_s = period_s / 2.0 + (0.0 if regular else varies_s + period_s)
         bounds_s: list[float] = []
         for plant, at_once in self._blocks:
-            most = at_once.most_s(apart_s)
+            most = _most_s(at_once, apart_s)
             aside_s = _bisected(lambda s, most=most: _gain(s - off_s, s + off_s, period_s, windows) < most, mean_s)
             if regular and off_s != 0.0:
-                around = _Response.of(plant, self.timing, self.assumed_s, mean_s).most_s(apart_s)
+                around = _most_s(_peaks(plant, self.timing, self.assumed_s, mean_s), apart_s)
                 aside_s = max(aside_s, _bisected(lambda s, most=around: _gain(s, s, period_s, 1) < most, mean_s))
             bounds_s.append(aside_s)
         return min(bounds_s)
 
     @cached_property
-    def _blocks(self) -> list[tuple[HeldPlant, "_Response"]]:
-        """Each block, and how it answers without mismatch."""
+    def _blocks(self) -> list[tuple[HeldPlant, list[float]]]:
+        """Each block, and its `_peaks` without mismatch."""
         loop = checked_loop(self.A, self.B, self.K)
         mask = checked_mask(loop, self.measured)
         plants = held_blocks(*loop, period_s=self.timing.control_s, measured=mask)
-        return [(own, _Response.of(own, self.timing, self.assumed_s, self.assumed_s)) for own in plants]
+        return [(own, _peaks(own, self.timing, self.assumed_s, self.assumed_s)) for own in plants]
 
 
-@dataclass(frozen=True)
-class _Response:
-    """Largest gains from sums of pulses to u_j - u_{j-1} in one block, for each power of b; () if it is unstable."""
+def _most_s(peaks: list[float], apart_s: float) -> float:
+    """The least g (s) at which the sum over the powers of b = `apart_s` is one; 0 if the loop is unstable."""
+    if not peaks:
+        return 0.0
+    factors = np.cumprod([1.0, *(apart_s / power for power in range(1, len(peaks)))])
+    total = float(factors @ np.array(peaks))
+    return 1.0 / total if total > 0.0 else inf
 
-    peaks: tuple[float, ...]
 
-    def most_s(self, apart_s: float) -> float:
-        """The least g (s) at which the sum over the powers of b is one; 0 if the loop is unstable."""
-        if not self.peaks:
-            return 0.0
-        factors = np.cumprod([1.0, *(apart_s / power for power in range(1, len(self.peaks)))])
-        total = float(factors @ np.array(self.peaks))
-        return 1.0 / total if total > 0.0 else inf
+def _peaks(plant: HeldPlant, timing: Timing, assumed_s: float, mean_s: float) -> list[float]:
+    """Largest gains from sums of pulses to u_j - u_{j-1} in one block, for each power of b; none if it is unstable."""
+    if mean_s == assumed_s:
+        radius = block_radius(plant, 0.0)  # the loop behind the delay is that without
+    else:
+        radius = lifted_radius(plant, timing, delay_s=mean_s, predictor=Predictor(plant, assumed_s))
+    if radius >= 1.0:
+        return []
+    A, seen = plant.A, np.ones(len(plant.A), dtype=np.bool_) if plant.measured is None else plant.measured
+    A_seen = np.where(np.outer(seen, seen), A, 0.0)
+    ahead = plant.carry(np.array([assumed_s + plant.period_s / 2.0]))[0]
+    onto = np.hstack([ahead @ plant.B, ahead @ A[:, ~seen] * _integral(A, plant.B, ~seen)])
+    grid = np.union1d(np.geomspace(_LOWEST, pi, _ANGLES), np.linspace(0.0, pi, _ANGLES)[1:])
+    found = list[float]()
+    while not found or onto.any():
 
-    @staticmethod
-    def of(plant: HeldPlant, timing: Timing, assumed_s: float, mean_s: float) -> "_Response":
-        if mean_s == assumed_s:
-            radius = block_radius(plant, 0.0)  # the loop behind the delay is that without
-        else:
-            radius = lifted_radius(plant, timing, delay_s=mean_s, predictor=Predictor(plant, assumed_s))
-        if radius >= 1.0:
-            return _Response(())
-        A, seen = plant.A, np.ones(len(plant.A), dtype=np.bool_) if plant.measured is None else plant.measured
-        A_seen = np.where(np.outer(seen, seen), A, 0.0)
-        ahead = plant.carry(np.array([assumed_s + plant.period_s / 2.0]))[0]
-        onto = np.hstack([ahead @ plant.B, ahead @ A[:, ~seen] * _integral(A, plant.B, ~seen)])
-        grid = np.union1d(np.geomspace(_LOWEST, pi, _ANGLES), np.linspace(0.0, pi, _ANGLES)[1:])
-        found = list[float]()
-        while not found or onto.any():
+        def gain(angle: FloatArray, onto: FloatArray = onto) -> FloatArray:
+            return spectral_norms(_rows(plant, angle, assumed_s, mean_s) @ onto)
 
-            def gain(angle: FloatArray, onto: FloatArray = onto) -> FloatArray:
-                return spectral_norms(_rows(plant, angle, assumed_s, mean_s) @ onto)
-
-            found.append(highest(gain, grid)[1])
-            onto = A_seen @ onto
-            if found[-1] <= _SMALL * found[0] or len(found) > 30:
-                break
-        return _Response(tuple(found))
+        found.append(highest(gain, grid)[1])
+        onto = A_seen @ onto
+        if found[-1] <= _SMALL * found[0] or len(found) > 30:
+            break
+    return found
 
 
 def _rows(plant: HeldPlant, angle: FloatArray, assumed_s: float, mean_s: float) -> ComplexArray:

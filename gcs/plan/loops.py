@@ -85,7 +85,7 @@ def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Windo
     if not is_modelled(plan):
         return 0.0, plan.delay_margin_s
     if len(block.system_ids) == 1:
-        return block.loop.window_s()
+        return block.window_s()
     if block.margin_s() == inf:
         return 0.0, inf
     expected_s = planned_loop_delays_s(plan)

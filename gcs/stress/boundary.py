@@ -14,7 +14,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.several import boundary_of_two_delays, late_by_vehicle
 from gains.performance.response import formation_loop
-from gains.sampled.coupled_block import CoupledBlock, PredictedLoop, unlike_blocks
+from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gains.varying.predicted import PredictedSpread
@@ -128,10 +128,11 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     if scenario.control.prediction == "off":
         jitter_s = _proved_s(blocks, study.plan.timing.held_s, delays_s)
     else:
-        loops = [each.loop for each in blocks if isinstance(each.loop, PredictedLoop) and len(each.system_ids) == 1]
-        if len(loops) < len(blocks) or any(link.reordering for link in jittery):
+        assumed_s = study.plan.assumed_s
+        shared = any(len(block.system_ids) > 1 for block in blocks)
+        if assumed_s is None or shared or any(link.reordering for link in jittery):
             return None
-        jitter_s = np.min([_proved_predicted_s(loop, delays_s) for loop in loops], axis=0)
+        jitter_s = np.min([_proved_predicted_s(block, assumed_s, delays_s) for block in blocks], axis=0)
     jitter_s = np.minimum(jitter_s, delays_s / 2.0)  # delays cannot be negative
     return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
 
@@ -153,7 +154,7 @@ def _proved_s(blocks: Sequence[CoupledBlock], period_s: float, delays_s: FloatAr
     return np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
 
 
-def _proved_predicted_s(loop: PredictedLoop, delays_s: FloatArray) -> FloatArray:
+def _proved_predicted_s(block: CoupledBlock, assumed_s: float, delays_s: FloatArray) -> FloatArray:
     """The jitter proved at each link delay for one vehicle, predicted; below 0 where nothing is.
 
     With jitter of at most j each way, a state is between up - j and up + j + T old when it is first used. The assumed
@@ -161,8 +162,8 @@ def _proved_predicted_s(loop: PredictedLoop, delays_s: FloatArray) -> FloatArray
     acts d - 2 j to d + 2 j + T, less the assumed loop delay, after it is assumed to; d is the delay of both links. See
     `gains.varying.predicted.PredictedSpread`.
     """
-    wait_s = loop.timing.control_s
-    spread = PredictedSpread(loop.A, loop.B, loop.K, loop.timing, loop.assumed_s, loop.measured)
+    wait_s = block.timing.control_s
+    spread = PredictedSpread(block.A, block.B, block.K, block.timing, assumed_s, block.measured)
 
     def proved(delay_s: float, jitter_s: float) -> bool:
         bound_s = spread.bound_s(mean_s=delay_s + wait_s / 2.0, telemetry_s=jitter_s)

@@ -90,7 +90,7 @@ def _draw_models(above: Any, study: Study, delays_s: FloatArray, vehicle: int | 
         above.plot(some_s, list(rates), color=SAMPLED, linewidth=1.4, label=label)
         return
     kinds = unlike_blocks(blocks)
-    sampled = np.array([[kind.loop.growth_1_s(at) for at in delays_s.tolist()] for kind in kinds])
+    sampled = np.array([[kind.growth_1_s(at) for at in delays_s.tolist()] for kind in kinds])
     fastest = [kinds[k] for k in sampled.argmax(axis=0)[::_SPARSE]]
     continuous = [kind.growth_continuous_1_s(at) for kind, at in zip(fastest, some_s.tolist(), strict=True)]
     above.plot(some_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")

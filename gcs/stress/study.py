@@ -285,11 +285,11 @@ def _found(
     assert nearest.critical is not None
     block = next(block for block in blocks if nearest.probed in block.system_ids)
     end, way = (0, -1.0) if shorter else (1, 1.0)
-    ends_s = [way * kind.loop.window_s()[end] for kind in unlike_blocks(blocks)]
+    ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(blocks)]
     # for the loop that breaks first, test the figure that the station flies by
-    own_s = block.loop.window_s()[end]
+    own_s = block.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
-    continuous_s = block.loop.window_continuous_s()[end] if is_modelled(study.plan) else None
+    continuous_s = block.window_continuous_s()[end] if is_modelled(study.plan) else None
     if vehicle is not None and len(block.system_ids) > 1:  # the margin depends on the delays of the others
         predicted_s, continuous_s = (
             _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")

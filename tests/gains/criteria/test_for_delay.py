@@ -17,8 +17,8 @@ from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.requirement import Criteria, Requirement
-from gains.criteria.figures import LoopFigures
-from gains.criteria.poles import pole_region, roots_of
+from gains.core.structure import roots_of
+from gains.criteria.figures import LoopFigures, pole_region
 from gains.design.design import design
 from gains.design.for_delay import criteria_gains, longest_static_delay
 from gains.formation.model import FormationModel

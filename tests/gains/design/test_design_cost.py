@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from gains.core.errors import BadModelError
 from gains.design.lqr import Weights, centralised_lqr
 from gains.formation.model import FormationModel
-from gains.formation.pattern import formation_plant
+from gains.formation.pattern import Plant, formation_plant
 from gcs.studies.compare_cost import DesignCost, ratios
 
 CHAIN = formation_plant(FormationModel((-1, 0, 1), axes=1))
@@ -24,6 +25,19 @@ def test_centralised_lqr_is_stationary_at_the_lyapunov_equations_cost() -> None:
     assert cost(K) == pytest.approx(least, rel=1e-10)
     rng = np.random.default_rng(3)
     assert all(cost(K + 1e-2 * rng.normal(size=K.shape)) > least for _ in range(20))
+
+
+@pytest.mark.parametrize("name", ["Q", "R"])
+@pytest.mark.parametrize(
+    "wrong", [np.eye(2), np.triu(np.ones((3, 3))), -np.eye(3), np.full((3, 3), np.nan), np.diag([1.0, 1.0, -1e-9])]
+)
+def test_weights_that_are_not_wanted_are_refused(name: str, wrong: np.ndarray) -> None:
+    plant = Plant(-np.eye(3), np.eye(3))
+    weights = Weights(np.eye(3), np.eye(3))._replace(**{name: wrong})
+    with pytest.raises(
+        BadModelError, match=f"{name}, of shape .*: a symmetric, positive .*definite matrix of 3 rows is wanted"
+    ):
+        centralised_lqr(plant, weights)
 
 
 def test_ratios_are_against_inclusion_of_five_vehicles() -> None:

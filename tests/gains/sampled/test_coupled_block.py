@@ -60,7 +60,7 @@ def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
     for block, margin_s in ((leader, pi / (-2.0 * K1)), (follower, atan(-K1 * omega / K3) / omega)):
         assert block.margin_s() == pytest.approx(margin_s - period_s / 2.0, abs=1e-6)
         at_s = margin_s - period_s / 2.0
-        assert block.loop.growth_1_s(at_s) == pytest.approx(0.0, abs=1e-5)
+        assert block.growth_1_s(at_s) == pytest.approx(0.0, abs=1e-5)
         assert block.growth_continuous_1_s(at_s) == pytest.approx(0.0, abs=1e-9)
 
 

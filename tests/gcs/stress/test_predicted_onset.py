@@ -37,7 +37,7 @@ def test_the_search_ends_at_either_end_of_the_window(study: Study, *, shorter: b
 
     def fly(trial: Trial) -> Outcome:
         link_s = dict(trial.coordinates)["delay"]
-        growth_1_s = block.loop.growth_1_s(link_s + WAITING_S)
+        growth_1_s = block.growth_1_s(link_s + WAITING_S)
         verdict = "unstable" if growth_1_s > 0.0 else "stable"
         known = Outcome(trial.id, trial.kind, 1, dict(trial.coordinates), real_time=False, verdict=verdict)
         delays = {"link_delay_s": link_s, "loop_delay_s": link_s + WAITING_S, "waiting_s": WAITING_S}
