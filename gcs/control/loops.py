@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gains.sampled.onboard import own_part
 from gcs.control.acted import ActiveTargets
-from gcs.control.history import Reports
-from gcs.control.law import FeedbackLaw, VehicleLaw, commands_at, commands_of, feedback_law, formation_control
+from gcs.control.history import Instants, Reports
+from gcs.control.law import FeedbackLaw, commands_at, commands_of, feedback_law, formation_control
 from gcs.control.predicted_stream import StreamPrediction
 from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.control.responding import Responding
@@ -31,6 +31,7 @@ from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
+_NEVER_NS = np.iinfo(np.int64).max
 
 
 class Moment(NamedTuple):
@@ -170,7 +171,7 @@ class PredictingGroundLoop:
         controls = self._ground.control(history, law, blends, now)
         acts_ns, assumed_s = self._states.look(history, now.due_ns)
         commands = commands_at(self._states, law, acts_ns, blends, now.nominal_velocity_m_s, now.opening)
-        _replace(controls, (acts_ns > 0) & _flown(law), command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
+        _replace(controls, (acts_ns > 0) & law.flown, command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
         return controls
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
@@ -213,10 +214,10 @@ class StreamedLoop:
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
         controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_m_s, opening=opening)
-        used_ns = np.array([_oldest_needed(history, own) for own in law.vehicles])
+        used_ns = _oldest_needed_ns(law, controls["sample_ns"])
         commands = commands_at(history, law, used_ns, blends, nominal_m_s, opening)
         others = (used_ns > 0) & (used_ns != controls["sample_ns"])
-        _replace(controls, others & _flown(law), command_m_s2=commands, used_ns=used_ns)
+        _replace(controls, others & law.flown, command_m_s2=commands, used_ns=used_ns)
         self.open(controls["command_m_s2"], opening)
         return controls
 
@@ -260,15 +261,14 @@ class PredictingStreamedLoop:
         controls = self._streamed.control(history, law, blends, now)
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
         self._prediction.look(history, law, now.due_ns, nominal_m_s)
-        own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.packed.source), 4))
+        own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.source), 4))
         acts_ns, assumed_s = np.zeros(len(controls), np.int64), np.zeros(len(controls))
-        for row, vehicle_law in enumerate(law.vehicles):
-            found = None if vehicle_law is None else self._prediction.states(row)
-            if vehicle_law is not None and found is not None:
+        for row in range(len(controls)):
+            found = self._prediction.states(row)
+            if found is not None:
                 acts_ns[row], assumed_s[row], states = found
-                first = law.packed.begin[row]
-                own[row] = states[row]
-                seen[first : first + len(vehicle_law.terms)] = [states[term.source] for term in vehicle_law.terms]
+                terms = slice(law.begin[row], law.begin[row + 1])
+                own[row], seen[terms] = states[row], [states[source] for source in law.source[terms].tolist()]
         commands = commands_of(law, own, seen, blends, nominal_m_s, opening)
         self._streamed.open(commands, opening)
         used_ns = np.array([self._prediction.used_ns(row) for row in range(len(controls))])
@@ -295,8 +295,11 @@ def _replace(controls: Records, which: NDArray[np.bool_], **fields: NDArray[Any]
         controls[name][which] = values[which]
 
 
-def _flown(law: FeedbackLaw) -> NDArray[np.bool_]:
-    return np.array([own is not None for own in law.vehicles])
+def _oldest_needed_ns(law: FeedbackLaw, sample_ns: Instants) -> Instants:
+    """The instant of the oldest among the newest states that each law needs; 0 if it needs none or one is unknown."""
+    needed, oldest_ns = law.needed, np.full(len(law.ahead), _NEVER_NS)
+    np.minimum.at(oldest_ns, law.to[needed], sample_ns[law.source[needed]])
+    return np.where(oldest_ns == _NEVER_NS, 0, oldest_ns)
 
 
 def _remember_all(loop: Loop, orders: Orders) -> None:
@@ -315,11 +318,3 @@ def _deliveries(plan: FlightPlan) -> list[Delivery]:
 def _gains(plan: FlightPlan, lost: Sequence[bool], returning: Sequence[bool] | None) -> tuple[Any, ...]:
     """The gain schedule, or what replaces it while others do without a vehicle."""
     return plan.around_loss if plan.around_loss and any((*lost, *(returning or ()))) else plan.gains
-
-
-def _oldest_needed(history: Reports, law: VehicleLaw | None) -> int:
-    """The instant of the oldest among the newest states that a law needs; 0 if it needs none or one is unknown."""
-    if law is None:
-        return 0
-    newest = [history.newest(term.source) for term in law.terms if any(map(any, term.gains))]
-    return min((0 if report is None else report[0] for report in newest), default=0)

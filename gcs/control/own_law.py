@@ -115,7 +115,7 @@ class OwnLawLoop:
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
         controls = formation_control(history, law, blends, nominal_velocity_m_s=velocity_m_s, opening=opening)
-        flown = np.array([own is not None for own in law.vehicles])
+        flown = law.flown
         instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0
         if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
             controls["command_m_s2"] = nan

@@ -162,7 +162,7 @@ class Station:
         monitor, tolerated = self._monitor, self._tolerated
         assert tolerated is not None
         return Usual(
-            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law.packed,
+            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law,
             monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
             self._critical, monitor.modes, monitor.gain_sets,
             monitor.released, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,

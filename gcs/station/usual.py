@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import every_at, every_newest
-from gcs.control.law import CONTROL, PackedLaw, control_all, nearest_of
+from gcs.control.law import CONTROL, FeedbackLaw, control_all, nearest_of
 from gcs.control.limits import any_beyond, shorten
 from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import accelerations
@@ -99,7 +99,7 @@ class Usual(NamedTuple):
     """Of LIMITS, (1,)."""
     tables: Tables
     row_of: Ints
-    law: PackedLaw
+    law: FeedbackLaw
     blends: Records
     watched: Watched
     policy: Policy
