@@ -16,8 +16,8 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import Reports
-from gcs.control.law import FeedbackLaw, feedback_law, formation_control
-from gcs.control.loops import GroundLoop, Moment
+from gcs.control.law import FeedbackLaw, feedback_law
+from gcs.control.loops import Loop, Moment
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import LawFormation, accelerations, law_formation
 from scenarios.kernel import Records
@@ -96,15 +96,12 @@ class FlownLaw:
             self._hooks.stop(f"law failed: {BAD_IN_A_ROW} calls in a row without a usable command, the last: {what}")
 
 
-class OwnLawLoop:
-    """The ground loop with commands from the user's own law. See `gcs.control.loops.Loop`."""
-
-    heeds_deliveries = False
+class OwnLawLoop(Loop):
+    """The ground loop with commands from the user's own law."""
 
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
-        ground, self._plan, self._law = GroundLoop(plan), plan, law
-        self.delivered, self.remember, self.set_points = ground.delivered, ground.remember, ground.set_points
-        self.parameters, self.sent, self.active = ground.parameters, ground.sent, ground.active
+        super().__init__(plan)
+        self._law = law
         self._known: tuple[Vector, float] | None = None
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 
@@ -114,7 +111,7 @@ class OwnLawLoop:
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
-        controls = formation_control(history, law, blends, nominal_velocity_m_s=velocity_m_s, opening=opening)
+        controls = super().control(history, law, blends, now)
         flown = law.flown
         instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0
         if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing

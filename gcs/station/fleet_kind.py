@@ -11,7 +11,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.loops import GroundLoop, Loop, Orders
+from gcs.control.loops import Loop, Orders
 from gcs.control.manoeuvring import loop_of
 from gcs.control.own_law import FlownLaw, LawHooks
 from gcs.control.phases import Phase, patience_s
@@ -98,7 +98,7 @@ class LaunchedFleet:
 
     @property
     def is_usual(self) -> bool:
-        return isinstance(self.loop, GroundLoop)
+        return type(self.loop) is Loop
 
     def __init__(self, plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> None:
         scenario = plan.scenario
