@@ -16,10 +16,9 @@ from collections.abc import Sequence
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.control.history import Instants, Report, Reports, State, each_at
+from gcs.control.history import Instants, Report, Reports, State
 from gcs.control.law import FeedbackLaw
 from gcs.control.loops import Loop, Moment, Orders, steady_loop
 from gcs.control.own_law import FlownLaw, OwnLawLoop
@@ -83,7 +82,7 @@ class ManoeuvringLoop(Loop):
         return points
 
 
-class _RelativeStates:
+class _RelativeStates(Reports):
     """`gcs.control.history.Reports` relative to the planned motion, as of one tick."""
 
     def __init__(self, loop: ManoeuvringLoop, history: Reports, now: Moment) -> None:
@@ -96,9 +95,6 @@ class _RelativeStates:
     def at(self, vehicle: int, time_ns: int) -> State | None:
         state = self._history.at(vehicle, time_ns)
         return None if state is None else self._relative(vehicle, state, time_ns)
-
-    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
-        return each_at(self, vehicles.tolist(), times_ns.tolist())
 
     def every_newest(self) -> tuple[Instants, FloatArray]:
         times_ns, states = self._history.every_newest()
