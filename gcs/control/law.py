@@ -230,22 +230,17 @@ class Nearest(NamedTuple):
     """The two that are nearest."""
 
 
-def nearest(controls: Records, now_ns: int, down_m: FloatArray | None = None) -> Nearest:
-    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
-
-    `down_m` holds the vehicles' positions down if they fly at different altitudes; without it, distances are
-    horizontal.
-    """
-    return Nearest(*nearest_of(controls, now_ns, np.empty(0) if down_m is None else down_m))
-
-
 _ROUNDED_UP = 1.0 + 1e-9
 """A distance is not larger than this times one that is computed otherwise, whatever was rounded."""
 
 
 @array_kernel
-def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
-    """See `nearest`; `down_m` is empty if it does not matter."""
+def nearest(controls: Records, now_ns: int, down_m: Array) -> Nearest:
+    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
+
+    `down_m` holds the vehicles' positions down if they fly at different altitudes; if it is empty, distances are
+    horizontal.
+    """
     n = len(controls)
     north, east, near = np.empty(n), np.empty(n), np.full(n, inf)
     for row in range(n):
@@ -275,4 +270,4 @@ def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArra
                 k += way
     for row in range(n):
         near[row] = sqrt(near[row]) if near[row] < inf else nan
-    return near, (one, two)
+    return Nearest(near, (one, two))
