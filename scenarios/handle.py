@@ -43,6 +43,7 @@ def handle(arrays: Any) -> Handle:
 
 @array_kernel
 def _handle(arrays: Any) -> Any:
+    """What is kept of it on disk names the classes of the tuples: when one is renamed, this file has to change, too."""
     return Handle(_borrowed(arrays))
 
 

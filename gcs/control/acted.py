@@ -23,8 +23,9 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from math import inf, isfinite
-from typing import Any, Protocol
+from typing import Any
 
+from gcs.control.prediction import CommandHistory
 from gcs.link.mavlink import VELOCITY_IGNORED
 
 _AGES = 3
@@ -38,12 +39,6 @@ _ROUNDED = 2.0**-22
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
 """Places among the fields of POSITION_TARGET_LOCAL_NED."""
 _ON_THE_WIRE = struct.Struct("<2f")
-
-
-class Alterable(Protocol):
-    """A history of set-points: `gcs.control.prediction.CommandHistory`."""
-
-    def alter(self, due_ns: int, by_m_s2: complex) -> None: ...
 
 
 def _extrapolated(vector: Sequence[float]) -> complex:
@@ -66,7 +61,7 @@ def _is_shortened(reported: complex, sent: complex) -> bool:
 class ActiveTargets:
     """The set-points sent to one vehicle, and what its reports say of them; corrects the history of its prediction."""
 
-    def __init__(self, history: Alterable, *, period_ns: int, held_ns: int) -> None:
+    def __init__(self, history: CommandHistory, *, period_ns: int, held_ns: int) -> None:
         self._history, self._period_ns, self._held_ns = history, period_ns, held_ns
         self._due_ns: list[int] = []
         self._velocity: list[complex] = []

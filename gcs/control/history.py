@@ -23,7 +23,7 @@ _UNKNOWN = (nan, nan, nan, nan)
 
 
 class States(Protocol):
-    """Where vehicles are at any instant."""
+    """Where vehicles are at any instant. Whoever inherits this needs `at` only."""
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing."""
@@ -31,7 +31,8 @@ class States(Protocol):
 
     def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
         """The states (m, 4) of m vehicles, each at an instant of its own; NaN where nothing was reported."""
-        ...
+        each = zip(vehicles.tolist(), times_ns.tolist(), strict=True)
+        return np.array([self.at(vehicle, time_ns) or _UNKNOWN for vehicle, time_ns in each]).reshape(-1, 4)
 
 
 class Reports(States, Protocol):
@@ -44,12 +45,6 @@ class Reports(States, Protocol):
     def every_newest(self) -> tuple[Instants, FloatArray]:
         """Instant and state (n, 4) of the newest report of each vehicle; 0 and NaN where there is none."""
         ...
-
-
-def each_at(states: States, vehicles: Sequence[int], times_ns: Sequence[int]) -> FloatArray:
-    """`States.every_at`, one by one."""
-    found = (states.at(vehicle, time_ns) or _UNKNOWN for vehicle, time_ns in zip(vehicles, times_ns, strict=True))
-    return np.array([*found]).reshape(-1, 4)
 
 
 class StateHistory:

@@ -9,8 +9,6 @@ margin.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from math import inf, nan, sqrt
 from typing import NamedTuple
 
@@ -22,70 +20,40 @@ from gcs.control.history import Instants, Reports, States
 from gcs.plan.formation import Formation
 from scenarios.kernel import Array, Records, array_kernel
 
-Gain = tuple[float, float, float, float, float, float, float, float]
-"""A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""
+LOST = -2
+"""In place of the vehicle ahead of a lost one."""
 
 
-class Term(NamedTuple):
-    """What one vehicle's state contributes to the command of another."""
-
-    source: int
-    """The vehicle k whose state is used."""
-    offset_ne_m: tuple[float, float]
-    """Its wanted position relative to the commanded vehicle."""
-    gains: tuple[Gain, ...]
-    """The block of each set of the gain schedule."""
-
-
-class VehicleLaw(NamedTuple):
+class FeedbackLaw(NamedTuple):
     """u_i = sum over its terms of G_ik (x_k - x*_k), x_k = (position, velocity), x*_k = (place in formation, v_d).
 
-    Positions are relative to the vehicle's own, so its own term has velocity only.
+    Positions are relative to the vehicle's own, so its own term has velocity only. The laws of n vehicles have m terms
+    in all, in the order of the vehicles; a lost vehicle has none. They are arrays for kernels.
     """
-
-    terms: tuple[Term, ...]
-    ahead: int
-    """The vehicle that spacing is kept to, one of the terms; -1 if there is none."""
-
-
-_LOST = -2
-
-
-class PackedLaw(NamedTuple):
-    """The laws of n vehicles with m terms in all, as arrays for kernels."""
 
     begin: NDArray[np.int64]
     """Place of each vehicle's first term, and m, (n + 1,)."""
     to: NDArray[np.int64]
-    """The vehicle that each term commands, (m,)."""
+    """The vehicle i that each term commands, (m,)."""
     source: NDArray[np.int64]
-    """The vehicle whose state it uses, (m,)."""
+    """The vehicle k whose state it uses, (m,)."""
     offset_ne_m: FloatArray
-    """(m, 2)"""
+    """The wanted position of k relative to i, (m, 2)."""
     gains: FloatArray
-    """(m, sets, 8)"""
+    """The block G_ik (2, 4) of each set of the gain schedule, row by row: command (north, east) from position and
+    velocity (north, east), (m, sets, 8)."""
     ahead: NDArray[np.int64]
-    """`VehicleLaw.ahead`, -2 for a lost vehicle, (n,)."""
+    """The vehicle that spacing is kept to, one of the sources; -1 if there is none, LOST for a lost vehicle, (n,)."""
 
+    @property
+    def flown(self) -> NDArray[np.bool_]:
+        """Which vehicles are not lost, (n,)."""
+        return self.ahead != LOST
 
-@dataclass(frozen=True, eq=False)
-class FeedbackLaw:
-    """The law of each vehicle; None if it is lost."""
-
-    vehicles: tuple[VehicleLaw | None, ...]
-
-    @cached_property
-    def packed(self) -> PackedLaw:
-        terms = [(to, term) for to, law in enumerate(self.vehicles) if law is not None for term in law.terms]
-        counts = [0 if law is None else len(law.terms) for law in self.vehicles]
-        return PackedLaw(
-            np.cumsum([0, *counts]),
-            np.array([to for to, _ in terms], np.int64),
-            np.array([term.source for _, term in terms], np.int64),
-            np.array([term.offset_ne_m for _, term in terms]).reshape(-1, 2),
-            np.array([term.gains for _, term in terms]) if terms else np.zeros((0, 1, 8)),
-            np.array([_LOST if law is None else law.ahead for law in self.vehicles], np.int64),
-        )
+    @property
+    def needed(self) -> NDArray[np.bool_]:
+        """Which terms have a gain other than zero, so that a command depends on their states, (m,)."""
+        return np.logical_or.reduce(self.gains, axis=(1, 2))
 
 
 def feedback_law(
@@ -103,7 +71,7 @@ def feedback_law(
     model = formation.model
     without = [one or other for one, other in zip(lost, returning or lost, strict=True)]
     K = np.stack(gains)
-    in_front = [-1] * model.vehicles
+    ahead = np.full(model.vehicles, LOST)
     blocks: dict[tuple[int, int], FloatArray] = {}
 
     def block(i: int, k: int) -> FloatArray:
@@ -115,7 +83,7 @@ def feedback_law(
         if without[i]:
             gone = [away and row != i for row, away in enumerate(without)]
             stand_in, front = _stand_ins(model.predecessors, gone)
-        in_front[i] = front[i]
+        ahead[i] = front[i]
         block(i, i)
         if front[i] >= 0:
             block(i, front[i])
@@ -130,18 +98,11 @@ def feedback_law(
                 # e_j^p = Z_ahead - Z_j - d
                 block(i, front[j])[:, :, :2] += on_spacing
                 block(i, j)[:, :, :2] -= on_spacing
-    place = formation.place_ne_m()
-
-    def offset(i: int, k: int) -> tuple[float, float]:
-        north, east = (place[k] - place[i]).tolist()
-        return north, east
-
-    def law(i: int) -> VehicleLaw:
-        sources = sorted(k for to, k in blocks if to == i)
-        terms = tuple(Term(k, offset(i, k), tuple(tuple(G.ravel().tolist()) for G in blocks[i, k])) for k in sources)
-        return VehicleLaw(terms, in_front[i])
-
-    return FeedbackLaw(tuple(None if lost[i] else law(i) for i in range(len(in_front))))
+    place, keys = formation.place_ne_m(), sorted(blocks)
+    to, source = np.array(keys, np.int64).reshape(-1, 2).T.copy()
+    by_term = np.array([blocks[key] for key in keys]).reshape(-1, len(gains), 8)
+    begin = np.searchsorted(to, np.arange(model.vehicles + 1))
+    return FeedbackLaw(begin, to, source, place[source] - place[to], by_term, ahead)
 
 
 def _stand_ins(predecessors: Sequence[int], gone: Sequence[bool]) -> tuple[list[int], list[int]]:
@@ -191,8 +152,8 @@ def formation_control(
     """
     times_ns, states = history.every_newest()
     controls = np.empty(len(times_ns), CONTROL)
-    seen = history.every_at(law.packed.source, times_ns.take(law.packed.to))
-    control_all(controls, law.packed, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
+    seen = history.every_at(law.source, times_ns.take(law.to))
+    control_all(controls, law, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
     return controls
 
 
@@ -205,10 +166,9 @@ def commands_at(
     opening: float,
 ) -> FloatArray:
     """The command (n, 2) of each vehicle from the errors at an instant of its own."""
-    packed = law.packed
     own = states.every_at(np.arange(len(times_ns)), times_ns)
-    seen, others = own[packed.to], (packed.source != packed.to).nonzero()[0]
-    seen[others] = states.every_at(packed.source[others], times_ns[packed.to[others]])
+    seen, others = own[law.to], (law.source != law.to).nonzero()[0]
+    seen[others] = states.every_at(law.source[others], times_ns[law.to[others]])
     return commands_of(law, own, seen, blends, nominal_velocity_m_s, opening)
 
 
@@ -222,19 +182,19 @@ def commands_of(
 ) -> FloatArray:
     """The same from the vehicles' own states (n, 4) and those that the terms of their laws use (m, 4)."""
     controls = np.empty(len(own), CONTROL)
-    control_all(controls, law.packed, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
+    control_all(controls, law, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
     return controls["command_m_s2"]
 
 
 @array_kernel
 def control_all(
-    controls: Records, law: PackedLaw, times_ns: Array, states: Array, seen: Array, blends: Records,
+    controls: Records, law: FeedbackLaw, times_ns: Array, states: Array, seen: Array, blends: Records,
     nominal_north: float, nominal_east: float, opening: float,
 ) -> None:  # fmt: skip
     """Fill in the controls: the command of each vehicle is the sum of G_ik (x_k - x*_k) over its terms."""
     g = np.empty(8)
     for row in range(len(controls)):
-        control, state, flown = controls[row], states[row], law.ahead[row] != _LOST
+        control, state, flown = controls[row], states[row], law.ahead[row] != LOST
         control.sample_ns = control.used_ns = times_ns[row]
         control.assumed_s, control.acts_ns = 0.0, 0
         for k in range(4):
@@ -270,22 +230,17 @@ class Nearest(NamedTuple):
     """The two that are nearest."""
 
 
-def nearest(controls: Records, now_ns: int, down_m: FloatArray | None = None) -> Nearest:
-    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
-
-    `down_m` holds the vehicles' positions down if they fly at different altitudes; without it, distances are
-    horizontal.
-    """
-    return Nearest(*nearest_of(controls, now_ns, np.empty(0) if down_m is None else down_m))
-
-
 _ROUNDED_UP = 1.0 + 1e-9
 """A distance is not larger than this times one that is computed otherwise, whatever was rounded."""
 
 
 @array_kernel
-def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArray, tuple[int, int]]:
-    """See `nearest`; `down_m` is empty if it does not matter."""
+def nearest(controls: Records, now_ns: int, down_m: Array) -> Nearest:
+    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
+
+    `down_m` holds the vehicles' positions down if they fly at different altitudes; if it is empty, distances are
+    horizontal.
+    """
     n = len(controls)
     north, east, near = np.empty(n), np.empty(n), np.full(n, inf)
     for row in range(n):
@@ -315,4 +270,4 @@ def nearest_of(controls: Records, now_ns: int, down_m: Array) -> tuple[FloatArra
                 k += way
     for row in range(n):
         near[row] = sqrt(near[row]) if near[row] < inf else nan
-    return near, (one, two)
+    return Nearest(near, (one, two))

@@ -7,7 +7,7 @@ delay counts from that instant; nothing is extrapolated, unless the station pred
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gains.sampled.onboard import own_part
 from gcs.control.acted import ActiveTargets
-from gcs.control.history import Reports
-from gcs.control.law import FeedbackLaw, VehicleLaw, commands_at, commands_of, feedback_law, formation_control
+from gcs.control.history import Instants, Reports
+from gcs.control.law import FeedbackLaw, commands_at, commands_of, feedback_law, formation_control
 from gcs.control.predicted_stream import StreamPrediction
 from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.control.responding import Responding
@@ -31,6 +31,7 @@ from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
+_NEVER_NS = np.iinfo(np.int64).max
 
 
 class Moment(NamedTuple):
@@ -56,45 +57,50 @@ class Orders(NamedTuple):
     due_ns: int
 
 
-class Loop(Protocol):
-    """What depends on where the loop is closed."""
+class Loop:
+    """The loop that the station closes around each vehicle, by sending it its whole command.
 
-    @property
-    def heeds_deliveries(self) -> bool:
-        """Whether `delivered` does anything."""
-        ...
+    Other loops override what depends on where a loop is closed and on what is predicted.
+    """
+
+    heeds_deliveries = False
+    """Whether `delivered` does anything."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        self._plan = plan
 
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         """The station's share of each vehicle's command, without the lost ones: see `law.feedback_law`."""
-        ...
+        return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         """Errors of every vehicle at a tick, and the acceleration it is sent: see `law.formation_control`."""
-        ...
+        return formation_control(
+            history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
+        )
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Take in the one-way delay that was measured for a vehicle, of a message sent at `sent_ns`."""
-        ...
 
     def set_points(self, orders: Orders) -> Records:
         """The set-points (n, SET_POINT) that carry the commands of those vehicles that follow them."""
-        ...
+        points = np.zeros(len(orders.controls), SET_POINT)
+        accelerations(points, orders.controls, orders.commanded)
+        return points
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         """Take in the acceleration that a vehicle is sent."""
-        ...
 
     def sent(self, due_ns: int, points: Records) -> None:
         """Take in the set-points as they were sent."""
-        ...
 
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
         """Take in the fields of a POSITION_TARGET_LOCAL_NED: what a vehicle followed at an instant."""
-        ...
 
     def parameters(self, system_id: int) -> dict[str, float]:
         """The parameters that must be set on a vehicle before it is armed."""
-        ...
+        del system_id
+        return {}
 
 
 def steady_loop(plan: FlightPlan) -> Loop:
@@ -102,42 +108,7 @@ def steady_loop(plan: FlightPlan) -> Loop:
     control = plan.scenario.control
     if control.loop == "onboard":
         return StreamedLoop(plan) if control.prediction == "off" else PredictingStreamedLoop(plan)
-    return GroundLoop(plan) if control.prediction == "off" else PredictingGroundLoop(plan)
-
-
-class GroundLoop:
-    """The station closes every loop: it sends each vehicle its whole command."""
-
-    heeds_deliveries = False
-
-    def __init__(self, plan: FlightPlan) -> None:
-        self._plan = plan
-
-    def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
-        return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
-
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        return formation_control(
-            history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
-        )
-
-    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
-        """Nothing to do: the newest states are fed back as they are."""
-
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
-        """Nothing to do either."""
-
-    def sent(self, due_ns: int, points: Records) -> None: ...
-    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
-
-    def set_points(self, orders: Orders) -> Records:
-        points = np.zeros(len(orders.controls), SET_POINT)
-        accelerations(points, orders.controls, orders.commanded)
-        return points
-
-    def parameters(self, system_id: int) -> dict[str, float]:
-        del system_id
-        return {}
+    return Loop(plan) if control.prediction == "off" else PredictingGroundLoop(plan)
 
 
 @kernel
@@ -149,14 +120,13 @@ def accelerations(points: Records, controls: Records, commanded: Array) -> None:
             points[row].acceleration_ne_m_s2[k] = controls[row].command_m_s2[k]
 
 
-class PredictingGroundLoop:
-    """The ground loop, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
+class PredictingGroundLoop(Loop):
+    """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
 
     heeds_deliveries = True
 
     def __init__(self, plan: FlightPlan) -> None:
-        self._ground = GroundLoop(plan)
-        self.law, self.parameters = self._ground.law, self._ground.parameters
+        super().__init__(plan)
         vehicles = range(plan.model.vehicles)
         every = plan.responses_in_order
         held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
@@ -167,10 +137,10 @@ class PredictingGroundLoop:
         self._states = PredictedStates(self._sent, self._deliveries, plan.timing)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        controls = self._ground.control(history, law, blends, now)
+        controls = super().control(history, law, blends, now)
         acts_ns, assumed_s = self._states.look(history, now.due_ns)
         commands = commands_at(self._states, law, acts_ns, blends, now.nominal_velocity_m_s, now.opening)
-        _replace(controls, (acts_ns > 0) & _flown(law), command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
+        _replace(controls, (acts_ns > 0) & law.flown, command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
         return controls
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
@@ -178,7 +148,7 @@ class PredictingGroundLoop:
 
     def set_points(self, orders: Orders) -> Records:
         _remember_all(self, orders)
-        return self._ground.set_points(orders)
+        return super().set_points(orders)
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         self._sent[row].add(due_ns, acceleration_m_s2)
@@ -192,13 +162,11 @@ class PredictingGroundLoop:
         self._targets[row].reported(at_ns, fields)
 
 
-class StreamedLoop:
+class StreamedLoop(Loop):
     """Vehicles close loops of their own: the station uploads their gains and streams what they cannot know."""
 
-    heeds_deliveries = False
-
     def __init__(self, plan: FlightPlan) -> None:
-        self._plan = plan
+        super().__init__(plan)
         own, model = own_part(plan.model, plan.gain), plan.model
         self._opened_m_s2 = np.zeros((model.vehicles, 2))
         """K_ii^p times the offset: added when the spacing is doubled, which the vehicle's own loop does not know."""
@@ -211,27 +179,17 @@ class StreamedLoop:
         return feedback_law(self._plan.formation, streamed, lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
-        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_m_s, opening=opening)
-        used_ns = np.array([_oldest_needed(history, own) for own in law.vehicles])
-        commands = commands_at(history, law, used_ns, blends, nominal_m_s, opening)
+        controls = super().control(history, law, blends, now)
+        used_ns = _oldest_needed_ns(law, controls["sample_ns"])
+        commands = commands_at(history, law, used_ns, blends, now.nominal_velocity_m_s, now.opening)
         others = (used_ns > 0) & (used_ns != controls["sample_ns"])
-        _replace(controls, others & _flown(law), command_m_s2=commands, used_ns=used_ns)
-        self.open(controls["command_m_s2"], opening)
+        _replace(controls, others & law.flown, command_m_s2=commands, used_ns=used_ns)
+        self._open(controls["command_m_s2"], now.opening)
         return controls
 
-    def open(self, commands_m_s2: FloatArray, opening: float) -> None:
+    def _open(self, commands_m_s2: FloatArray, opening: float) -> None:
         """Add to commands (n, 2) what a wider spacing takes, of which the vehicles know nothing."""
         commands_m_s2 += (opening - 1.0) * self._opened_m_s2
-
-    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
-        """Nothing to do: nothing is predicted."""
-
-    def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
-        """Nothing to do either."""
-
-    def sent(self, due_ns: int, points: Records) -> None: ...
-    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
 
     def set_points(self, orders: Orders) -> Records:
         points = np.zeros(len(orders.controls), SET_POINT)
@@ -245,32 +203,29 @@ class StreamedLoop:
         return own_parameters(formation, self._plan.gain, formation.row(system_id))
 
 
-class PredictingStreamedLoop:
+class PredictingStreamedLoop(StreamedLoop):
     """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.predicted_stream`)."""
 
     heeds_deliveries = True
 
     def __init__(self, plan: FlightPlan) -> None:
-        self._streamed = StreamedLoop(plan)
-        self.law, self.parameters = self._streamed.law, self._streamed.parameters
-        self.sent, self.active = self._streamed.sent, self._streamed.active
+        super().__init__(plan)
         self._prediction = StreamPrediction(plan, _deliveries(plan))
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        controls = self._streamed.control(history, law, blends, now)
+        controls = super().control(history, law, blends, now)
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
         self._prediction.look(history, law, now.due_ns, nominal_m_s)
-        own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.packed.source), 4))
+        own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.source), 4))
         acts_ns, assumed_s = np.zeros(len(controls), np.int64), np.zeros(len(controls))
-        for row, vehicle_law in enumerate(law.vehicles):
-            found = None if vehicle_law is None else self._prediction.states(row)
-            if vehicle_law is not None and found is not None:
+        for row in range(len(controls)):
+            found = self._prediction.states(row)
+            if found is not None:
                 acts_ns[row], assumed_s[row], states = found
-                first = law.packed.begin[row]
-                own[row] = states[row]
-                seen[first : first + len(vehicle_law.terms)] = [states[term.source] for term in vehicle_law.terms]
+                terms = slice(law.begin[row], law.begin[row + 1])
+                own[row], seen[terms] = states[row], [states[source] for source in law.source[terms].tolist()]
         commands = commands_of(law, own, seen, blends, nominal_m_s, opening)
-        self._streamed.open(commands, opening)
+        self._open(commands, opening)
         used_ns = np.array([self._prediction.used_ns(row) for row in range(len(controls))])
         _replace(
             controls, acts_ns > 0, command_m_s2=commands, used_ns=used_ns, assumed_s=assumed_s, acts_ns=acts_ns
@@ -282,7 +237,7 @@ class PredictingStreamedLoop:
 
     def set_points(self, orders: Orders) -> Records:
         _remember_all(self, orders)
-        return self._streamed.set_points(orders)
+        return super().set_points(orders)
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
         del due_ns  # that of the tick begun
@@ -295,8 +250,11 @@ def _replace(controls: Records, which: NDArray[np.bool_], **fields: NDArray[Any]
         controls[name][which] = values[which]
 
 
-def _flown(law: FeedbackLaw) -> NDArray[np.bool_]:
-    return np.array([own is not None for own in law.vehicles])
+def _oldest_needed_ns(law: FeedbackLaw, sample_ns: Instants) -> Instants:
+    """The instant of the oldest among the newest states that each law needs; 0 if it needs none or one is unknown."""
+    needed, oldest_ns = law.needed, np.full(len(law.ahead), _NEVER_NS)
+    np.minimum.at(oldest_ns, law.to[needed], sample_ns[law.source[needed]])
+    return np.where(oldest_ns == _NEVER_NS, 0, oldest_ns)
 
 
 def _remember_all(loop: Loop, orders: Orders) -> None:
@@ -315,11 +273,3 @@ def _deliveries(plan: FlightPlan) -> list[Delivery]:
 def _gains(plan: FlightPlan, lost: Sequence[bool], returning: Sequence[bool] | None) -> tuple[Any, ...]:
     """The gain schedule, or what replaces it while others do without a vehicle."""
     return plan.around_loss if plan.around_loss and any((*lost, *(returning or ()))) else plan.gains
-
-
-def _oldest_needed(history: Reports, law: VehicleLaw | None) -> int:
-    """The instant of the oldest among the newest states that a law needs; 0 if it needs none or one is unknown."""
-    if law is None:
-        return 0
-    newest = [history.newest(term.source) for term in law.terms if any(map(any, term.gains))]
-    return min((0 if report is None else report[0] for report in newest), default=0)

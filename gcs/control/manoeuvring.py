@@ -16,10 +16,9 @@ from collections.abc import Sequence
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.control.history import Instants, Report, Reports, State, each_at
+from gcs.control.history import Instants, Report, Reports, State
 from gcs.control.law import FeedbackLaw
 from gcs.control.loops import Loop, Moment, Orders, steady_loop
 from gcs.control.own_law import FlownLaw, OwnLawLoop
@@ -35,15 +34,16 @@ def loop_of(plan: FlightPlan, law: FlownLaw | None = None) -> Loop:
     return ManoeuvringLoop(plan, loop) if plan.scenario.manoeuvres else loop
 
 
-class ManoeuvringLoop:
-    """See `gcs.control.loops.Loop`; `inner` is the loop that closes around the planned motion."""
+class ManoeuvringLoop(Loop):
+    """The loop `inner`, closed around the planned motion."""
 
     heeds_deliveries = True
 
     def __init__(self, plan: FlightPlan, inner: Loop) -> None:
-        self._inner, self._row = inner, plan.formation.row
-        self._motion = PlannedMotion(plan.scenario, plan.formation)
-        self._start_m = plan.formation.place_ne_m().tolist()
+        super().__init__(plan)
+        self._inner = inner
+        self.motion = PlannedMotion(plan.scenario, plan.formation)
+        self.start_m = plan.formation.place_ne_m().tolist()
         self.follows_another = plan.scenario.course.leader == "external"
         vehicles = range(plan.model.vehicles)
         self._down_ns = [0 for _ in vehicles]
@@ -58,26 +58,12 @@ class ManoeuvringLoop:
         controls = self._inner.control(_RelativeStates(self, history, now), law, blends, still)
         for row, down_ns in enumerate(self._down_ns):
             acts_s = now.time_s + (down_ns + self._half_period_ns) * 1e-9
-            _, self._velocity_m_s[row], self._more_m_s2[row] = self._motion.reference(row, acts_s, now.opening)
+            _, self._velocity_m_s[row], self._more_m_s2[row] = self.motion.reference(row, acts_s, now.opening)
         controls["command_m_s2"] += self._more_m_s2
         if self.follows_another:
             controls["command_m_s2"][0] = nan
         controls["state"] = history.every_newest()[1]
         return controls
-
-    def relative(self, row: int, state: State, time_s: float, opening: float, leader: State | None) -> State:
-        """A state relative to the planned motion; `leader` is that of a leader flown by somebody else."""
-        place, velocity, _ = self._motion.reference(row, time_s, opening)
-        start_north, start_east = self._start_m[row]
-        north, east, v_north, v_east = state
-        if leader is not None:
-            velocity = velocity[0] + leader[2], velocity[1] + leader[3]
-        return (
-            north - (place[0] - opening * start_north),
-            east - (place[1] - opening * start_east),
-            v_north - velocity[0],
-            v_east - velocity[1],
-        )
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         self._down_ns[row] = down_ns
@@ -96,7 +82,7 @@ class ManoeuvringLoop:
         return points
 
 
-class _RelativeStates:
+class _RelativeStates(Reports):
     """`gcs.control.history.Reports` relative to the planned motion, as of one tick."""
 
     def __init__(self, loop: ManoeuvringLoop, history: Reports, now: Moment) -> None:
@@ -110,9 +96,6 @@ class _RelativeStates:
         state = self._history.at(vehicle, time_ns)
         return None if state is None else self._relative(vehicle, state, time_ns)
 
-    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
-        return each_at(self, vehicles.tolist(), times_ns.tolist())
-
     def every_newest(self) -> tuple[Instants, FloatArray]:
         times_ns, states = self._history.every_newest()
         for row in np.flatnonzero(times_ns).tolist():
@@ -121,6 +104,16 @@ class _RelativeStates:
         return times_ns, states
 
     def _relative(self, vehicle: int, state: State, instant_ns: int) -> State:
+        time_s, opening = self._now.time_s + (instant_ns - self._now.due_ns) * 1e-9, self._now.opening
+        place, velocity, _ = self._loop.motion.reference(vehicle, time_s, opening)
+        start_north, start_east = self._loop.start_m[vehicle]
+        north, east, v_north, v_east = state
         leader = self._history.at(0, instant_ns) if self._loop.follows_another else None
-        time_s = self._now.time_s + (instant_ns - self._now.due_ns) * 1e-9
-        return self._loop.relative(vehicle, state, time_s, self._now.opening, leader)
+        if leader is not None:
+            velocity = velocity[0] + leader[2], velocity[1] + leader[3]
+        return (
+            north - (place[0] - opening * start_north),
+            east - (place[1] - opening * start_east),
+            v_north - velocity[0],
+            v_east - velocity[1],
+        )

@@ -8,7 +8,6 @@ row the flight ends, and the vehicles hold.
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Any
 
@@ -16,8 +15,8 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import Reports
-from gcs.control.law import FeedbackLaw, feedback_law, formation_control
-from gcs.control.loops import GroundLoop, Moment
+from gcs.control.law import FeedbackLaw, feedback_law
+from gcs.control.loops import Loop, Moment
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import LawFormation, accelerations, law_formation
 from scenarios.kernel import Records
@@ -33,33 +32,31 @@ Vector = tuple[float, float]
 _HOLD = 0.0, 0.0
 
 
-@dataclass(frozen=True)
-class LawHooks:
-    """What a law needs of the station that flies it."""
-
-    stop: Callable[[str], None] = lambda _: None
-    """Ends the flight for a reason."""
-    note: Callable[[str, dict[str, int] | None], None] = lambda _text, _counts: None
-    """Records an event: its text and its counts."""
-    clock_ns: Callable[[], int] | None = None
-    """Measures how long calls take; None in virtual time, in which nothing may depend on the machine."""
-
-
 class FlownLaw:
-    """The law of a flight, its memory and its record."""
+    """The law of a flight, its memory and its record.
 
-    def __init__(self, plan: FlightPlan, hooks: LawHooks) -> None:
+    `report` records an event: its kind, its text, no system id, and its counts. `stop` ends the flight for a reason.
+    `clock_ns` measures how long calls take; None in virtual time, in which nothing may depend on the machine.
+    """
+
+    def __init__(
+        self,
+        plan: FlightPlan,
+        report: Callable[[str, str, None, dict[str, int] | None], None],
+        stop: Callable[[str], None],
+        clock_ns: Callable[[], int] | None = None,
+    ) -> None:
         assert plan.law is not None
-        self._law, self._hooks = plan.law, hooks
+        self._law, self._report, self._stop, self._clock_ns = plan.law, report, stop, clock_ns
         self._budget_ns = round(BUDGET_SHARE * plan.timing.step_s * 1e9)
         self._memory: dict[str, Any] = {}
-        self._counts = Counter({CALLS: 0, BAD: 0} | ({} if hooks.clock_ns is None else {OVER: 0}))
+        self._counts = Counter({CALLS: 0, BAD: 0} | ({} if clock_ns is None else {OVER: 0}))
         self._bad_in_a_row = 0
 
     def commands(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
         """The acceleration of each vehicle, zero in place of one that cannot be used; lost vehicles have NaN states."""
         lost: list[bool] = np.isnan(states[:, 0]).tolist()
-        clock_ns, fault = self._hooks.clock_ns, ""
+        clock_ns, fault = self._clock_ns, ""
         began_ns = 0 if clock_ns is None else clock_ns()
         try:
             found = self._called(t_s, states, formation)
@@ -75,7 +72,7 @@ class FlownLaw:
     def report(self) -> None:
         """Record the counts as an event, at the end of the flight."""
         texts = (f"{count} {name}" for name, count in self._counts.items())
-        self._hooks.note(", ".join(texts), dict(self._counts))
+        self._report(LAW, ", ".join(texts), None, dict(self._counts))
 
     def _called(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
         with np.errstate(all="ignore"):  # what is not finite is counted
@@ -91,20 +88,17 @@ class FlownLaw:
         ids = " ".join(str(formation.system_ids[row]) for row in bad[:8])
         what = " ".join(f"{fault}, vehicle{'s' * (len(bad) > 1)} {ids}".split())[:200]
         if self._counts[BAD] == 1:
-            self._hooks.note(f"no usable command: {what}", None)
+            self._report(LAW, f"no usable command: {what}", None, None)
         if self._bad_in_a_row == BAD_IN_A_ROW:
-            self._hooks.stop(f"law failed: {BAD_IN_A_ROW} calls in a row without a usable command, the last: {what}")
+            self._stop(f"law failed: {BAD_IN_A_ROW} calls in a row without a usable command, the last: {what}")
 
 
-class OwnLawLoop:
-    """The ground loop with commands from the user's own law. See `gcs.control.loops.Loop`."""
-
-    heeds_deliveries = False
+class OwnLawLoop(Loop):
+    """The ground loop with commands from the user's own law."""
 
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
-        ground, self._plan, self._law = GroundLoop(plan), plan, law
-        self.delivered, self.remember, self.set_points = ground.delivered, ground.remember, ground.set_points
-        self.parameters, self.sent, self.active = ground.parameters, ground.sent, ground.active
+        super().__init__(plan)
+        self._law = law
         self._known: tuple[Vector, float] | None = None
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 
@@ -114,8 +108,8 @@ class OwnLawLoop:
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
-        controls = formation_control(history, law, blends, nominal_velocity_m_s=velocity_m_s, opening=opening)
-        flown = np.array([own is not None for own in law.vehicles])
+        controls = super().control(history, law, blends, now)
+        flown = law.flown
         instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0
         if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
             controls["command_m_s2"] = nan

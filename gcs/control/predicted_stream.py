@@ -24,7 +24,7 @@ from gains.core.arrays import FloatArray
 from gains.sampled._loop import matrix_exponentials
 from gains.sampled.onboard import own_part, streamed_loop
 from gcs.control.history import Reports, State
-from gcs.control.law import FeedbackLaw, VehicleLaw
+from gcs.control.law import FeedbackLaw
 from gcs.control.prediction import KEPT_S, Delivery, FirstUses, FixedDelivery
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from scenarios.schema import NS_PER_S
@@ -53,12 +53,13 @@ class StreamPrediction:
         self._inputs: list[FloatArray] = []
         """u at each tick (vehicles, 2), held until the next."""
         self._streamed, self._sent_ns = np.zeros((model.vehicles, 2)), [0] * model.vehicles
-        self._needs: tuple[FeedbackLaw, list[list[int]]] = FeedbackLaw(()), []
+        self._needs: tuple[FeedbackLaw | None, list[list[int]]] = None, []
 
     def look(self, history: Reports, law: FeedbackLaw, due_ns: int, nominal_m_s: Sequence[float]) -> None:
         """Begin a tick: what was sent to each vehicle goes on until `remember` says otherwise."""
         if self._needs[0] is not law:
-            self._needs = law, [self._needed(own) for own in law.vehicles]
+            self._needs = law, [self._needed(law, row) for row in range(len(law.ahead))]
+            self._flown: list[bool] = law.flown.tolist()
         self._now_ns, self._history = due_ns, history
         target = np.array(nominal_m_s) - self._origin_m_s
         if self._due_ns:
@@ -98,7 +99,7 @@ class StreamPrediction:
         model, needed, used_ns = self._model, self._needs[1][row], self.used_ns(row)
         delays = [self._delivery_ns[k] for k in needed]
         own_ns = self._delivery_ns[row]
-        if own_ns is None or not used_ns or any(self._needs[0].vehicles[k] is None for k in needed):
+        if own_ns is None or not used_ns or not all(self._flown[k] for k in needed):
             return None
         z = np.zeros(model.states)
         seen = {k: self._history.at(k, used_ns) or (0.0, 0.0, 0.0, 0.0) for k in needed}
@@ -138,9 +139,9 @@ class StreamPrediction:
         own[vehicle] = self._inputs[place][vehicle]
         return self._flow.pushed(one[:, 0], own.ravel(), time_ns - self._due_ns[place])
 
-    def _needed(self, law: VehicleLaw | None) -> list[int]:
+    def _needed(self, law: FeedbackLaw, row: int) -> list[int]:
         """The vehicles whose motion decides the command: its sources, and those in front of them."""
-        found = {term.source for term in law.terms if any(map(any, term.gains))} if law else set[int]()
+        found: set[int] = {*law.source[law.needed & (law.to == row)].tolist()}
         for vehicle in reversed(range(self._model.vehicles)):  # those in front have lower numbers
             if vehicle in found:
                 found.add(max(0, self._model.predecessors[vehicle]))

@@ -18,14 +18,13 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from math import ceil, exp
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gains.sampled.multirate import Timing
-from gcs.control.history import Instants, Reports, State, StateHistory, each_at
+from gcs.control.history import Instants, Reports, State, StateHistory, States
 from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
 
@@ -43,31 +42,21 @@ Motion = tuple[complex, complex, tuple[complex, ...]]
 """V, P and what else the motion of a vehicle depends on; vectors are north + 1j * east."""
 
 
-class Responds(Protocol):
-    """How a vehicle moves under the accelerations that it is sent: `AtOnce` or `gcs.control.responding.Responding`."""
-
-    @property
-    def rest(self) -> Motion: ...
-
-    def moved(self, motion: Motion, u: complex, duration_s: float) -> Motion:
-        """The motion after a time under an acceleration."""
-        ...
-
-    def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
-        """The motion when the vehicle takes a set-point again, after its velocity had strayed from the set-points'."""
-        ...
-
-
 class AtOnce:
-    """V' = u: velocity that a lost set-point would have brought is never made up."""
+    """How a vehicle moves under the accelerations that it is sent, if it follows them at once: V' = u.
+
+    Velocity that a lost set-point would have brought is never made up.
+    """
 
     rest: Motion = 0j, 0j, ()
 
     def moved(self, motion: Motion, u: complex, duration_s: float) -> Motion:
+        """The motion after a time under an acceleration."""
         velocity, position, none = motion
         return velocity + u * duration_s, position + (velocity + 0.5 * u * duration_s) * duration_s, none
 
     def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
+        """The motion when the vehicle takes a set-point again, after its velocity had strayed from the set-points'."""
         del astray_m_s
         return motion
 
@@ -90,7 +79,7 @@ class CommandHistory:
     Without set-points for that long a vehicle enters its failsafe, in which it holds its velocity.
     """
 
-    def __init__(self, held_ns: int, responds: Responds | None = None) -> None:
+    def __init__(self, held_ns: int, responds: AtOnce | None = None) -> None:
         self._held_ns, self._responds = held_ns, responds or AtOnce()
         self._sent: list[_Sent] = [_Sent(0, 0j, self._responds.rest)]
         self._due_ns = [0]
@@ -155,34 +144,23 @@ def carried(sent: CommandHistory, state: State, from_ns: int, to_ns: int) -> Sta
     )
 
 
-class Delivery(Protocol):
-    """The delivery delay D that the prediction assumes for one vehicle."""
-
-    def measured(self, down_ns: int, sent_ns: int) -> None:
-        """Take in the one-way delay of a request that left at `sent_ns`."""
-        ...
-
-    def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
-        """D of the set-point due now; `age_ns` is the mean age of states at their first use. None while unknown."""
-        ...
-
-
 class FixedDelivery:
-    """D for a given loop delay: that delay minus the mean age of the states."""
+    """The delivery delay D of one vehicle for a given loop delay: that delay minus the mean age of the states."""
 
     def __init__(self, assumed_s: float) -> None:
         self._assumed_ns = round(assumed_s * NS_PER_S)
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
-        """Nothing to do: the delay is given."""
+        """Take in the one-way delay of a request that left at `sent_ns`; nothing to do, as the delay is given."""
 
-    def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
+    def assumed_ns(self, due_ns: int, age_ns: int) -> int:
+        """D of the set-point due now; `age_ns` is the mean age of states at their first use."""
         del due_ns
         return self._assumed_ns - age_ns
 
 
 class MeasuredDelivery:
-    """D from the measured one-way delays, smoothed along their trend; it changes at the rate `FASTEST` at most.
+    """The same from measured one-way delays, smoothed along their trend; it changes at the rate `FASTEST` at most.
 
     A fading-memory filter of second order: it follows a steadily growing delay without lag, although a measurement is
     known only one round trip after its request was sent. R. Morrison, "Introduction to sequential smoothing and
@@ -196,6 +174,7 @@ class MeasuredDelivery:
         """The last tick for which D was asked, and that D."""
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
+        """Take in the one-way delay of a request that left at `sent_ns`."""
         since_ns = sent_ns - self._at_ns
         if self._at_ns == 0:
             self._level_ns, self._at_ns = float(down_ns), sent_ns
@@ -208,6 +187,7 @@ class MeasuredDelivery:
             self._trend = min(FASTEST, max(-FASTEST, trend))
 
     def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
+        """D of the set-point due now; None while nothing has been measured."""
         del age_ns
         if self._at_ns == 0:
             return None
@@ -219,6 +199,9 @@ class MeasuredDelivery:
             aim_ns = min(assumed_ns + most_ns, max(assumed_ns - most_ns, aim_ns))
         self._assumed = due_ns, aim_ns
         return round(aim_ns)
+
+
+Delivery = FixedDelivery | MeasuredDelivery
 
 
 class FirstUses:
@@ -241,8 +224,8 @@ class FirstUses:
         return round(sum(self._ages_ns) / len(self._ages_ns))
 
 
-class PredictedStates:
-    """States predicted beyond the newest reports: `gcs.control.history.States` as of the last `look`."""
+class PredictedStates(States):
+    """States predicted beyond the newest reports, as of the last `look`."""
 
     def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], timing: Timing) -> None:
         self.deliveries, self._sent = deliveries, sent
@@ -274,6 +257,3 @@ class PredictedStates:
             return self._history.at(vehicle, time_ns)
         sample_ns, state = newest
         return carried(self._sent[vehicle], state, sample_ns - delivery_ns, time_ns - delivery_ns)
-
-    def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
-        return each_at(self, vehicles.tolist(), times_ns.tolist())

@@ -17,7 +17,7 @@ import numpy as np
 
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
-from gcs.control.prediction import Motion
+from gcs.control.prediction import AtOnce, Motion
 
 _APART = 1e-3
 """Relative change of the lag that separates coinciding modes; smaller than identification resolves."""
@@ -34,7 +34,7 @@ class _Mode(NamedTuple):
     """What 1 m/s of owed velocity adds to m; 0 if the response has no such state."""
 
 
-class Responding:
+class Responding(AtOnce):
     """The motion of a vehicle with a response, for `gcs.control.prediction.CommandHistory`; it holds V, P and the m.
 
     The velocity in a set-point is the integral of all accelerations sent. A vehicle that holds an earlier set-point

@@ -11,9 +11,9 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.loops import GroundLoop, Loop, Orders
+from gcs.control.loops import Loop, Orders
 from gcs.control.manoeuvring import loop_of
-from gcs.control.own_law import FlownLaw, LawHooks
+from gcs.control.own_law import FlownLaw
 from gcs.control.phases import Phase, patience_s
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import Links, RemoteVehicle, Report, in_words, new_links, refusals
@@ -79,14 +79,12 @@ class FleetKind(Protocol):
         ...
 
 
-def fleet_of(plan: FlightPlan, report: Report, hooks: LawHooks | None = None) -> FleetKind:
+def fleet_of(plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> FleetKind:
     """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id).
 
-    `hooks` are those of the user's own control law.
+    `law` is the user's own control law, if it is to be flown.
     """
-    if plan.scenario.dynamics == "autopilot":
-        return AutopilotFleet(plan, report)
-    return LaunchedFleet(plan, report, None if plan.law is None else FlownLaw(plan, hooks or LawHooks()))
+    return AutopilotFleet(plan, report) if plan.scenario.dynamics == "autopilot" else LaunchedFleet(plan, report, law)
 
 
 class LaunchedFleet:
@@ -98,7 +96,7 @@ class LaunchedFleet:
 
     @property
     def is_usual(self) -> bool:
-        return isinstance(self.loop, GroundLoop)
+        return type(self.loop) is Loop
 
     def __init__(self, plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> None:
         scenario = plan.scenario

@@ -1,6 +1,5 @@
 """The events of a flight and why it is to end, to which the parts of a station write."""
 
-from gcs.control.own_law import LAW
 from gcs.control.tick import Event
 from scenarios.schema import NS_PER_S
 
@@ -31,11 +30,7 @@ class Journal:
         """End the flight at the next tick; without a reason, go on."""
         self.stop = self.stop or reason
 
-    def report(self, kind: str, text: str, system_id: int | None = None) -> None:
+    def report(self, kind: str, text: str, system_id: int | None = None, counts: dict[str, int] | None = None) -> None:
         """Record an event."""
         time_s = self.scenario_time_s(self.now_ns)
-        self.events.append(Event(time_s=time_s, kind=kind, text=text, system_id=system_id))
-
-    def note_law(self, text: str, counts: dict[str, int] | None) -> None:
-        """Record an event of the user's control law."""
-        self.events.append(Event(time_s=self.scenario_time_s(self.now_ns), kind=LAW, text=text, counts=counts))
+        self.events.append(Event(time_s=time_s, kind=kind, text=text, system_id=system_id, counts=counts))

@@ -15,7 +15,7 @@ from gcs.control.law import nearest
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Orders
-from gcs.control.own_law import LawHooks
+from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
@@ -76,7 +76,8 @@ class Station:
         self._journal = journal = Journal(start_ns, self._start_patience_s)
         self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
         """See `Journal`."""
-        self._fleet = fleet_of(plan, journal.report, LawHooks(journal.request_stop, journal.note_law, stopwatch_ns))
+        own = None if plan.law is None else FlownLaw(plan, journal.report, journal.request_stop, stopwatch_ns)
+        self._fleet = fleet_of(plan, journal.report, own)
         self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
         self._period_ns = round(NS_PER_S / rates.control_hz)
@@ -162,7 +163,7 @@ class Station:
         monitor, tolerated = self._monitor, self._tolerated
         assert tolerated is not None
         return Usual(
-            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law.packed,
+            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law,
             monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
             self._critical, monitor.modes, monitor.gain_sets,
             monitor.released, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,
@@ -260,7 +261,7 @@ class Station:
         whether the formation is broken, and who is back near its place.
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
-        near = nearest(judged.controls, tick.due_ns, judged.reported["down_m"] if self._has_slots else None)
+        near = nearest(judged.controls, tick.due_ns, judged.reported["down_m"] if self._has_slots else np.empty(0))
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)

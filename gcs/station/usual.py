@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import every_at, every_newest
-from gcs.control.law import CONTROL, PackedLaw, control_all, nearest_of
+from gcs.control.law import CONTROL, FeedbackLaw, control_all, nearest
 from gcs.control.limits import any_beyond, shorten
 from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import accelerations
@@ -99,7 +99,7 @@ class Usual(NamedTuple):
     """Of LIMITS, (1,)."""
     tables: Tables
     row_of: Ints
-    law: PackedLaw
+    law: FeedbackLaw
     blends: Records
     watched: Watched
     policy: Policy
@@ -282,7 +282,7 @@ def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
     down_m = np.empty(len(controls) if limits.has_slots else 0)
     for row in range(len(down_m)):
         down_m[row] = tables.reported[row].down_m
-    near_m, _ = nearest_of(controls, due_ns, down_m)
+    near_m, _ = nearest(controls, due_ns, down_m)
     closest_m = inf
     for row in range(len(near_m)):
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])

@@ -272,7 +272,7 @@ class _Rebuilding:
             self._lost, self._law = lost, self._fleet.loop.law(lost)
         now = Moment(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
         controls = self._fleet.loop.control(self._history, self._law, unblended(len(lost)), now)
-        near = nearest(controls, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else None)
+        near = nearest(controls, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else np.empty(0))
         ids = [vehicle.remote.system_id for vehicle in self._vehicles]
         sent = [commands.get(system_id, (sent_ns, None)) for system_id in ids]
         controls["command_m_s2"] = [one or (nan, nan) for _, one in sent]

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from gcs import VirtualFlight, fly_virtual
-from gcs.control.own_law import BAD_IN_A_ROW, BUDGET_SHARE, FlownLaw, LawHooks
+from gcs.control.own_law import BAD_IN_A_ROW, BUDGET_SHARE, FlownLaw
 from gcs.errors import InputError
 from gcs.plan.own_law import NOT_LINEAR, OWN_DYNAMICS, LawFormation, law_formation
 from gcs.plan.planner import flight_plan
+from gcs.station.journal import Journal
 from scenarios.keys.course import ChangedOffset, FormationChange
 from scenarios.schema import Response
 from tests.support.fleets.own_code import LAW, coded, given
@@ -111,23 +112,25 @@ def test_a_law_that_fails_now_and_then_flies_on() -> None:
 
 
 def test_calls_over_their_budget_are_counted_by_the_clock_given() -> None:
-    plan, notes = flight_plan(coded(law="linear"))[1], list[tuple[str, dict[str, int] | None]]()
+    plan, events = flight_plan(coded(law="linear"))[1], list[tuple[object, ...]]()
     known = law_formation(plan.formation, (60.0, 0.0), 0.05)
     budget_ns = round(BUDGET_SHARE * 0.05e9)
     times_ns = iter([0, budget_ns, 0, budget_ns + 1, 0, 5 * budget_ns])
-    law = FlownLaw(
-        plan, LawHooks(note=lambda text, counts: notes.append((text, counts)), clock_ns=lambda: next(times_ns))
-    )
+
+    def report(kind: str, text: str, system_id: None, counts: dict[str, int] | None) -> None:
+        events.append((kind, text, system_id, counts))
+
+    law = FlownLaw(plan, report, list[str]().append, lambda: next(times_ns))
     for tick in range(3):
         law.commands(0.05 * tick, known.states(np.zeros(6)), known)
     law.report()
-    assert notes == [("3 calls, 0 bad, 2 over budget", {"calls": 3, "bad": 0, "over budget": 2})]
+    assert events == [("law", "3 calls, 0 bad, 2 over budget", None, {"calls": 3, "bad": 0, "over budget": 2})]
 
 
 def test_lost_vehicles_need_no_command() -> None:
     plan, reasons = flight_plan(coded(law="linear"))[1], list[str]()
     known = law_formation(plan.formation, (60.0, 0.0), 0.05)
-    law, states = FlownLaw(plan, LawHooks(stop=reasons.append)), known.states(np.zeros(6))
+    law, states = FlownLaw(plan, Journal(0, 0.0).report, reasons.append), known.states(np.zeros(6))
     states[1] = np.nan
     for _ in range(2 * BAD_IN_A_ROW):
         assert law.commands(0.0, states, known)[0] == (0.0, 0.0)

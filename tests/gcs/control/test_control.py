@@ -8,7 +8,7 @@ import pytest
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gcs.control.history import HISTORY, StateHistory
-from gcs.control.law import feedback_law, formation_control, unblended
+from gcs.control.law import FeedbackLaw, feedback_law, formation_control, unblended
 from gcs.control.limits import SetPointLimits
 from gcs.plan.formation import Formation
 
@@ -64,11 +64,18 @@ def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
     return np.concatenate(parts)
 
 
+def of_each(law: FeedbackLaw) -> list[object]:
+    """The law of each vehicle: its terms, and the vehicle ahead."""
+    terms = [slice(*law.begin[row : row + 2]) for row in range(5)]
+    parts = law.to, law.source, law.offset_ne_m, law.gains
+    return [([part[own].tolist() for part in parts], law.ahead.item(row)) for row, own in enumerate(terms)]
+
+
 @pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
 def test_others_do_without_a_vehicle_that_returns_by_its_own_law(gain: FloatArray) -> None:
     away = (False, True, False, False, False)
     returning, lost, all_there = (
-        feedback_law(TREE, (gain,), gone, back).vehicles
+        of_each(feedback_law(TREE, (gain,), gone, back))
         for gone, back in ((NOBODY, away), (away, NOBODY), (NOBODY, NOBODY))
     )
     assert returning[1] == all_there[1]

@@ -38,7 +38,7 @@ def test_the_nearest_are_those_among_all_pairs(on_a_grid: bool, slots: bool) -> 
         controls["state"] = rng.integers(-4, 5, (vehicles, 4)) * 100.0 if on_a_grid else scattered
         controls["state"][rng.random(vehicles) < 0.1] = nan
         down_m = rng.integers(0, 3, vehicles) * 100.0 if slots else None
-        found = nearest(controls, NOW_NS, down_m)
+        found = nearest(controls, NOW_NS, np.empty(0) if down_m is None else down_m)
         distance_m, two = of_all_pairs(controls, down_m)
         np.testing.assert_allclose(found.distance_m, distance_m, rtol=1e-15)
         assert tuple(found.two) == two
