@@ -164,8 +164,7 @@ class Station:
         return Usual(
             self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law.packed,
             monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
-            self._critical, monitor.modes, monitor.gain_sets,
-            monitor.released, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,
+            self._critical, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,
             HEARTBEAT, *self._scratch,
         )  # fmt: skip
 

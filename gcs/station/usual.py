@@ -105,9 +105,6 @@ class Usual(NamedTuple):
     policy: Policy
     guided: NDArray[np.bool_]
     critical: NDArray[np.bool_]
-    modes: Ints
-    gain_sets: Ints
-    released: NDArray[np.bool_]
     shorter_s: FloatArray
     used_s: FloatArray
     repeated_ns: Ints
@@ -255,7 +252,7 @@ def _command(usual: Usual, due: Due) -> tuple[Sending, NDArray[np.bool_]]:
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
     control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    followed = commanded(controls, usual.released, due.flying)
+    followed = commanded(controls, usual.watched.states.released, due.flying)
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
@@ -288,8 +285,9 @@ def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
     if due.flying and (closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)):
         return set_points, False
+    states = usual.watched.states
     judged = Judged(
-        usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, followed,
+        usual.system_ids, states.mode, states.gain_set, controls, tables.reported, usual.rtt_s, followed,
         usual.shorter_s, usual.watched.margins_s, repeated,
     )  # fmt: skip
     sent_ns = np.full(len(controls), due_ns)
