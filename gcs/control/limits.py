@@ -1,36 +1,11 @@
 """The scenario's limits, applied to every set-point that is sent, whatever computed it."""
 
-from dataclasses import dataclass
-
-from gains.core.arrays import FloatArray
 from scenarios.hypot import hypot
-from scenarios.kernel import Array, Records, kernel
-from scenarios.schema import Limits
+from scenarios.kernel import Array, kernel
 
 LARGEST_COMMAND_M_S2 = 9_999.0
 """The limit if the scenario sets none: a larger command is a fault, not a manoeuvre. Vehicles refuse more than 1e4,
 which rounding to float32 must not reach."""
-
-
-@dataclass(frozen=True)
-class SetPointLimits:
-    """Largest horizontal acceleration and speed that a set-point may ask for."""
-
-    acceleration_m_s2: float
-    speed_m_s: float
-
-    @classmethod
-    def of(cls, limits: Limits) -> "SetPointLimits":
-        return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
-
-    def limit_commands(self, commands_m_s2: FloatArray) -> None:
-        """Shorten accelerations (n, 2) to the limit, each in its own direction."""
-        shorten(commands_m_s2, self.acceleration_m_s2)
-
-    def limit(self, points: Records) -> None:
-        """Shorten the velocities and accelerations of set-points (n, SET_POINT) to the limits."""
-        shorten(points["velocity_ned_m_s"], self.speed_m_s)
-        shorten(points["acceleration_ne_m_s2"], self.acceleration_m_s2)
 
 
 @kernel

@@ -27,7 +27,6 @@ state of another vehicle, two clocks are involved and nothing cancels: it is `do
 from math import ceil, inf, nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from scenarios.kernel import Array, array_kernel
@@ -50,24 +49,19 @@ def headroom(delay_s: float, delay_margin_s: float) -> float:
     return -inf if delay_margin_s <= 0 else 1.0 - delay_s / delay_margin_s
 
 
-class Repetitions:
-    """How long each vehicle's set-points have repeated the same state because telemetry is slower than control."""
-
-    def __init__(self, rates: Rates, vehicles: int) -> None:
-        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
-        self.longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
-        self.known_ns = np.zeros((2, vehicles), np.int64)
-        """For each vehicle the instant of the state used last, and the tick that used it first."""
-
-    def repeated_s(self, used_ns: NDArray[np.int64], due_ns: int) -> FloatArray:
-        """Times from the first tick that used each state to the tick due now, at most one period of the telemetry."""
-        repeated: FloatArray = repeated_s(self.known_ns, self.longest_ns, used_ns, due_ns)
-        return repeated
+def longest_repetition_ns(rates: Rates) -> int:
+    """How long set-points repeat the same state at most because telemetry is slower than control."""
+    ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
+    return max(0, ticks) * round(NS_PER_S / rates.control_hz)
 
 
 @array_kernel
 def repeated_s(known_ns: Array, longest_ns: int, used_ns: Array, due_ns: int) -> FloatArray:
-    """See `Repetitions`."""
+    """How long the set-points of n vehicles have repeated the same state, in s, at most `longest_ns`.
+
+    That is the time from the first tick that used the state, `used_ns` (n,), to the tick due now. `known_ns` (2, n)
+    holds for each vehicle the instant of the state used last, and the tick that used it first; it is updated.
+    """
     repeated = np.empty(len(used_ns))
     for row in range(len(used_ns)):
         if used_ns[row] != known_ns[0, row]:

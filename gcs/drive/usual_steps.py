@@ -12,7 +12,7 @@ import numpy as np
 from gcs.control.tick import TICK, TickArray
 from gcs.link.datagram import Address, Arrivals
 from gcs.station.station import Station
-from gcs.station.usual import DONE, DUE, NOT_JUDGED, WITH_TICK, Due, Sending, Usual, usual_step
+from gcs.station.usual import DONE, DUE, NOT_JUDGED, WITH_TICK, Sending, Usual, usual_step
 from scenarios.kernel import Columns, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
@@ -210,10 +210,10 @@ def _step(ends: Any, known: int) -> int:
         return NOT_LEFT
     usual.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
-    next_tick = wire.due[min(ticks, len(wire.due) - 1)]
-    due = Due(ticks < known, next_tick.flying, next_tick.time_s, (next_tick.north_m_s, next_tick.east_m_s))
-    queued_ns, rows = np.zeros(leaving, np.int64), wire.rows[ticks * n : (ticks + 1) * n]
-    how_far, state.taken, first, second, third = usual_step(usual, wire.arrived, table, queued_ns, senders, due, rows)
+    queued_ns, due = np.zeros(leaving, np.int64), wire.due[min(ticks, len(wire.due) - 1)]
+    how_far, state.taken, first, second, third = usual_step(
+        usual, wire.arrived, table, queued_ns, senders, due, ticks < known, wire.rows[ticks * n : (ticks + 1) * n]
+    )
     state.sent = state.sent_bytes = 0
     _send(wire, first, places, now_ns)
     _send(wire, second, places, now_ns)

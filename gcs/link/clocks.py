@@ -45,7 +45,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, kernel
+from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, at_row, kernel
 from scenarios.schema import DRIFT_MAX_PPM
 
 WINDOW = 128
@@ -113,10 +113,9 @@ CLOCK = np.dtype(
         ("ways_ns", "f8"),  # quickest way up plus quickest way down behind the line
         ("fitted_ns", "i8"),  # when it was fitted
         ("tilt", "f8"),  # largest error of the line's rate
-        ("low_ns", "i8"), ("low_at_ns", "i8"), ("high_ns", "i8"), ("high_at_ns", "i8"),  # limits of the offset
+        ("limits", "i8", (4,)),  # of the offset: see `Limits`
         ("in_doubt", "?"),  # whether there was a doubtful exchange and it is not yet decided whether the clock jumped
-        # limits since the first doubtful exchange
-        ("since_low_ns", "i8"), ("since_low_at_ns", "i8"), ("since_high_ns", "i8"), ("since_high_at_ns", "i8"),
+        ("limits_in_doubt", "i8", (4,)),  # those since the first doubtful exchange
         ("doubtful_gap_ns", "f8"),  # the largest contradiction of these
         ("ahead_ns", "f8"),  # most by which a state since the newest exchange was sampled after reception, beyond bound
         ("held_back_ns", "i8"),  # the same within the bound: taken to have been sampled when it was received
@@ -185,32 +184,13 @@ def estimate_of(clock: Record) -> ClockEstimate:
 
 
 @kernel
-def _set_estimate(clock: Record, known: ClockEstimate) -> None:
-    clock.samples, clock.offset_ns, clock.skew = known.samples, known.offset_ns, known.skew
-    clock.bound_ns, clock.reference_ns = known.bound_ns, known.reference_ns
+def _limits_in(four: Array) -> Limits:
+    return Limits(four[0], four[1], four[2], four[3])
 
 
 @kernel
-def _known_limits(clock: Record) -> Limits:
-    return Limits(clock.low_ns, clock.low_at_ns, clock.high_ns, clock.high_at_ns)
-
-
-@kernel
-def _set_limits(clock: Record, limits: Limits) -> None:
-    clock.low_ns, clock.low_at_ns = limits.low_ns, limits.low_at_ns
-    clock.high_ns, clock.high_at_ns = limits.high_ns, limits.high_at_ns
-
-
-@kernel
-def _limits_in_doubt(clock: Record) -> Limits:
-    return Limits(clock.since_low_ns, clock.since_low_at_ns, clock.since_high_ns, clock.since_high_at_ns)
-
-
-@kernel
-def _set_limits_in_doubt(clock: Record, limits: Limits) -> None:
-    clock.since_low_ns, clock.since_low_at_ns = limits.low_ns, limits.low_at_ns
-    clock.since_high_ns, clock.since_high_at_ns = limits.high_ns, limits.high_at_ns
-    clock.in_doubt = True
+def _set_limits(four: Array, limits: Limits) -> None:
+    four[0], four[1], four[2], four[3] = limits
 
 
 @kernel
@@ -352,12 +332,12 @@ def reply(
     middle = sent_ns + rtt // 2
     offset = tc1_ns - middle
     own = Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - sent_ns + _READING_NS, sent_ns)
-    gap_ns = _gap_ns(_known_limits(clock), own) if clock.count else 0.0
+    gap_ns = _gap_ns(_limits_in(clock.limits), own) if clock.count else 0.0
     if clock.lost or gap_ns > STAMPS_OFF_NS:
         _jumped(clock, exchanges, sent_ns, 0)
     before = estimate_of(clock)
     if clock.count == 0:
-        _set_limits(clock, own)
+        _set_limits(clock.limits, own)
     elif _is_doubtful(clock, offset, rtt, middle, gap_ns):
         _doubt(clock, own, gap_ns)
     else:
@@ -415,11 +395,11 @@ def _explained_ns(clock: Record) -> float:
 def _doubt(clock: Record, own: Limits, gap_ns: float) -> None:
     """Keep the limits of a doubtful exchange beside the known ones."""
     if clock.in_doubt:
-        since = _limits_in_doubt(clock)
-        _set_limits_in_doubt(clock, _joined(since, own, _gap_ns(since, own) <= _explained_ns(clock)))
+        since = _limits_in(clock.limits_in_doubt)
+        _set_limits(clock.limits_in_doubt, _joined(since, own, _gap_ns(since, own) <= _explained_ns(clock)))
     else:
-        _set_limits_in_doubt(clock, own)
-    clock.doubtful_gap_ns = max(gap_ns, clock.doubtful_gap_ns)
+        _set_limits(clock.limits_in_doubt, own)
+    clock.in_doubt, clock.doubtful_gap_ns = True, max(gap_ns, clock.doubtful_gap_ns)
     clock.doubts_in_a_row += 1
     clock.ahead_ns = 0.0
 
@@ -431,13 +411,13 @@ def _fit(clock: Record, own: Limits) -> None:
     if clock.ahead_ns:
         clock.stamp_error_ns, clock.ahead_ns = _explained_ns(clock) + clock.ahead_ns, 0.0
     if clock.in_doubt:
-        since = _limits_in_doubt(clock)
+        since = _limits_in(clock.limits_in_doubt)
         if clock.doubts and _gap_ns(since, own) <= _explained_ns(clock):
-            _set_limits_in_doubt(clock, _joined(since, own, True))
+            _set_limits(clock.limits_in_doubt, _joined(since, own, True))
         else:
             clock.stamp_error_ns = max(clock.stamp_error_ns, clock.doubtful_gap_ns)
             clock.in_doubt, clock.doubtful_gap_ns, clock.doubts, clock.doubted_ns = False, 0.0, 0, 0
-    _set_limits(clock, _joined(_known_limits(clock), own, True))
+    _set_limits(clock.limits, _joined(_limits_in(clock.limits), own, True))
 
 
 @kernel
@@ -480,7 +460,7 @@ def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
     else:
         clock.jumps += 1
     if clock.in_doubt:
-        _set_limits(clock, _limits_in_doubt(clock))
+        _set_limits(clock.limits, _limits_in(clock.limits_in_doubt))
     clock.lost, clock.newest_boot_ns = False, _LONG_AGO_NS
     clock.in_doubt, clock.doubtful_gap_ns, clock.ahead_ns = False, 0.0, 0.0
     clock.count, clock.since_ns = keep, ts1_ns
@@ -491,9 +471,9 @@ def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
 @kernel
 def _stay_within_limits(clock: Record, at_ns: int) -> None:
     """Move the estimate to a time, and between the limits."""
-    known, limits = estimate_of(clock), _known_limits(clock)
+    known, limits = estimate_of(clock), _limits_in(clock.limits)
     if clock.in_doubt:
-        limits = _joined(limits, _limits_in_doubt(clock), False)
+        limits = _joined(limits, _limits_in(clock.limits_in_doubt), False)
     one_ns, other_ns = _low_at(limits, at_ns), _high_at(limits, at_ns)
     low_ns, high_ns = min(one_ns, other_ns), max(one_ns, other_ns)  # crossed by errors of stamps
     offset_ns = min(max(offset_at_ns(known, at_ns), low_ns), high_ns)
@@ -545,7 +525,8 @@ def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
         clock.ways_ns, clock.fitted_ns = ways_ns, now_ns
         clock.tilt = min(ageing, tilt + _WANDER)
     clock.unusual_ns = round(np.abs(y - skew * t - offset_ns).max())
-    _set_estimate(clock, ClockEstimate(n, base + round(offset_ns), skew, 0, now_ns))
+    clock.samples, clock.offset_ns, clock.skew = n, base + round(offset_ns), skew
+    clock.bound_ns, clock.reference_ns = 0, now_ns
 
 
 @array_kernel
@@ -556,47 +537,21 @@ def _quickest(t: _Floats, y: _Floats, rtt: _Floats, skew: float, ageing: float) 
     return low[(low + aged).argmax()], high[(high - aged).argmin()]
 
 
-@kernel
+@array_kernel
 def _sum(values: _Floats) -> float:
     """The sum of at most 128 values in the order in which numpy adds them, whatever the processor."""
-    n = len(values)
-    if n < 8:
-        total = 0.0
-        for k in range(n):
-            total += values[k]
-        return total
-    a, b, c, d, e, f, g, h = values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7]
-    for k in range(8, n - n % 8, 8):
-        a += values[k]
-        b += values[k + 1]
-        c += values[k + 2]
-        d += values[k + 3]
-        e += values[k + 4]
-        f += values[k + 5]
-        g += values[k + 6]
-        h += values[k + 7]
-    total = ((a + b) + (c + d)) + ((e + f) + (g + h))
-    for k in range(n - n % 8, n):
+    total, whole = 0.0, len(values) - len(values) % 8
+    if whole:
+        part = values[:8].copy()
+        for k in range(8, whole):
+            part[k % 8] += values[k]
+        total = ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]))
+    for k in range(whole, len(values)):
         total += values[k]
     return total
 
 
-@kernel
-def _request_at(clocks: Records, pending_ns: NDArray[np.int64], row: int, now_ns: int) -> int:
-    return request(clocks[row], pending_ns[row], now_ns)
-
-
-@kernel
-def _sampled_at(clocks: Records, row: int, boot_ms: int, received_ns: int, newest: bool) -> int:
-    return sampled_ns(clocks[row], boot_ms, received_ns, newest)
-
-
-@kernel
-def _reply_at(
-    clocks: Records, exchanges: Records, pending_ns: NDArray[np.int64], row: int,
-    tc1_ns: int, ts1_ns: int, received_ns: int,
-) -> int:  # fmt: skip
-    return reply(clocks[row], exchanges[row], pending_ns[row], tc1_ns, ts1_ns, received_ns)
+_request_at, _sampled_at, _reply_at = at_row(request), at_row(sampled_ns), at_row(reply)
 
 
 class Clocks(NamedTuple):
@@ -620,25 +575,16 @@ def new_clocks(n: int) -> Clocks:
 
 
 class VehicleClock:
-    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link: a row of `Clocks`."""
+    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link: a row of `Clocks`.
+
+    The comments in `CLOCK` say what its numbers are; None stands for UNKNOWN.
+    """
 
     samples = Cell[int]()
     """Exchanges behind the estimate; 0 while the clock is unknown."""
-    jumps = Cell[int]()
-    rtt_ns = Cell[int | None](UNKNOWN)
-    """Round trip of the newest exchange."""
-    down_ns = Cell[int | None](UNKNOWN)
-    """One-way delay from station to vehicle in the newest exchange, by the estimated offset."""
-    down_bound_ns = Cell[float]()
-    """Its largest error."""
-    loop_bound_ns = Cell[float]()
-    """The largest error that the clocks bring into a loop delay: age of the newest state plus `down_ns`."""
-    unmatched = Cell[int]()
-    """Replies to no request."""
-    expected_error_ns = Cell[int]()
-    """The largest error of stamps that is usual for this kind of vehicle."""
-    stamp_error_ns = Cell[float]()
-    """The largest error of stamps that contradictions between exchanges have shown."""
+    jumps, unmatched, expected_error_ns = Cell[int](), Cell[int](), Cell[int]()
+    rtt_ns, down_ns = Cell[int | None](UNKNOWN), Cell[int | None](UNKNOWN)
+    down_bound_ns, loop_bound_ns, stamp_error_ns = Cell[float](), Cell[float](), Cell[float]()
 
     def __init__(self, clocks: Clocks | None = None, row: int = 0) -> None:
         self._clocks, self._row = clocks or new_clocks(1), row
@@ -648,11 +594,6 @@ class VehicleClock:
     def estimate(self) -> ClockEstimate:
         return ClockEstimate(*(self._columns[name][self._row] for name in ClockEstimate._fields))
 
-    @estimate.setter
-    def estimate(self, estimate: ClockEstimate) -> None:
-        for name, value in zip(ClockEstimate._fields, estimate, strict=True):
-            self._clocks.known[name][self._row] = value
-
     @property
     def exchange_due(self) -> bool:
         """Whether a state was refused since the newest exchange, so that the next exchange must not wait."""
@@ -660,7 +601,7 @@ class VehicleClock:
 
     def request(self, now_ns: int) -> int:
         """Note a request sent now; returns its ts1, unique among the pending requests."""
-        return _request_at(self._clocks.known, self._clocks.pending_ns, self._row, now_ns)
+        return _request_at(self._clocks.known, self._row, self._clocks.pending_ns[self._row], now_ns)
 
     def boot_ns(self, boot_ms: int, near_ns: int) -> int:
         """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
@@ -680,5 +621,6 @@ class VehicleClock:
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
         """Take in a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
-        rtt_ns = _reply_at(*self._clocks, self._row, tc1_ns, ts1_ns, received_ns)
+        (known, exchanges, pending_ns), row = self._clocks, self._row
+        rtt_ns = _reply_at(known, row, exchanges[row], pending_ns[row], tc1_ns, ts1_ns, received_ns)
         return None if rtt_ns == UNKNOWN else rtt_ns

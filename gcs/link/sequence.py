@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from scenarios.kernel import Cell, Columns, Record, Records, kernel
+from scenarios.kernel import Cell, Columns, Record, Records, at_row, kernel
 from scenarios.schema import NS_PER_S
 
 _KEPT = 128
 """How far back the sequence counter remembers which frames arrived."""
 NEW, LATE, DUPLICATE = 0, 1, 2
-_NO_DOUBT = 100.0 * NS_PER_S
-"""While fewer than 100 frames are expected, the next number is the next frame."""
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
 _RATE_NS = NS_PER_S
@@ -57,14 +55,6 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
         return NEW
     since_ns = max(0, time_ns - counter.newest_ns)  # in a log the clock may have been set back
     expected = counter.rate_hz * since_ns
-    if step == 1 and (sequence - counter.newest) & 0xFF == 1 and counter.run == 0 and expected < _NO_DOUBT:
-        # A short cut: most frames are simply the next one. The general case below gives the same.
-        counter.lag *= 1.0 - _FORGET
-        _see_next(counter, 1)
-        if since_ns >= _STEADY_NS or time_ns - counter.rate_ns >= _RATE_NS:
-            _note_rate(counter, time_ns)
-        counter.newest_ns = time_ns
-        return NEW
     passed = int(min(expected, _LONGEST)) // NS_PER_S
     most = passed + max(_LEAST_AHEAD, _AHEAD - int(counter.lag))
     ahead = most - ((most - sequence + counter.newest) & 0xFF)
@@ -138,14 +128,7 @@ def _note_rate(counter: Record, time_ns: int) -> None:
     counter.rate_count, counter.rate_ns = counter.newest, time_ns
 
 
-@kernel
-def _count_at(counters: Records, row: int, sequence: int, time_ns: int) -> int:
-    return count(counters[row], sequence, time_ns)
-
-
-@kernel
-def _restart_at(counters: Records, row: int) -> None:
-    restart(counters[row])
+_count_at, _restart_at = at_row(count), at_row(restart)
 
 
 def new_counters(n: int) -> Records:

@@ -1,4 +1,4 @@
-"""The mode and the gain set of one vehicle, as its headroom changes: `monitored` is the whole decision.
+"""The mode and the gain set of one vehicle, as its headroom changes: `next_state` is the whole decision.
 
 As headroom shrinks, the vehicle's gains change to slower sets; last, it is released to its failsafe. When the link
 recovers, these actions are undone in the reverse order. One table says what each takes.
@@ -11,7 +11,7 @@ import numpy as np
 
 from gcs.control.loop_delay import headroom
 from gcs.control.tick import Mode
-from scenarios.kernel import Array, kernel
+from scenarios.kernel import Array, Record, kernel
 from scenarios.schema import Monitor
 
 _NUMBERS: Any = tuple(int(mode) for mode in Mode)
@@ -75,8 +75,9 @@ def policy_of(monitor: Monitor) -> Policy:
     return Policy(*(getattr(monitor, name) for name in Policy._fields))
 
 
-def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
-    """The state after one tick.
+@kernel
+def next_state(state: Record, seen: Observation, margins_s: Array, policy: Policy) -> None:
+    """Change a vehicle's state, a record of STATE, by one tick. `margins_s` are the margins of its gain sets.
 
     h is the headroom of the set flown, h+ that of the next faster set. "For hold" and "for ease" mean that the
     condition has lasted `policy.hold_s` or `policy.ease_s`. The first row that fits applies:
@@ -105,63 +106,58 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
     Gains do not change again while they are being blended. With `policy.act` off the modes are the same, but the gains
     stay the fastest set and no vehicle is released.
     """
-    number: Any = int(state.mode)
-    after = next_state(state._replace(mode=number), seen, np.array(margins_s), policy_of(policy))
-    return after._replace(mode=Mode(after.mode))
-
-
-@kernel
-def next_state(state: VehicleState, seen: Observation, margins_s: Array, policy: Policy) -> VehicleState:
-    """See `monitored`; modes are numbers."""
     away = state.mode == _LOST or state.mode == _FAILSAFE  # noqa: PLR1714 - Numba would make a tuple of them
     slowest = len(margins_s) - 1 if policy.act else 0
     if not seen.flying:
-        return VehicleState(_FAILSAFE if seen.failsafe else _WAITING, 0, 0, -1e9, inf, inf, False)
-    if seen.silent or not (seen.guided or state.released):
-        return _with(state, _LOST if seen.silent else _FAILSAFE, inf, inf)
-    if away and not state.released:
-        return _with_gains(_with(state, _RECOVERING, state.pressed_s, state.eased_s), slowest, seen.time_s)
-    if state.mode == _WAITING:
-        return _with(state, _NOMINAL, state.pressed_s, state.eased_s)
-    own = _headroom(seen.loop_delay_s, margins_s[state.gain_set])
-    if is_at_ease(state) and not own < policy.caution_headroom:
-        return state
-    # a released vehicle returns to the slowest set
-    faster = own if state.released else _headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
-    return _by_headroom(state, own, faster, slowest, policy, seen.time_s)
+        state.mode, state.gain_set, state.former_set = (_FAILSAFE if seen.failsafe else _WAITING), 0, 0
+        state.changed_s, state.pressed_s, state.eased_s, state.released = -1e9, inf, inf, False
+    elif seen.silent or not (seen.guided or state.released):
+        state.mode, state.pressed_s, state.eased_s = (_LOST if seen.silent else _FAILSAFE), inf, inf
+    elif away and not state.released:
+        state.mode = _RECOVERING
+        _change_gains(state, slowest, seen.time_s)
+    elif state.mode == _WAITING:
+        state.mode = _NOMINAL
+    else:
+        own = _headroom(seen.loop_delay_s, margins_s[state.gain_set])
+        if not is_at_ease(state) or own < policy.caution_headroom:
+            # a released vehicle returns to the slowest set
+            faster = own if state.released else _headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
+            _by_headroom(state, own, faster, slowest, policy, seen.time_s)
 
 
 @kernel
-def _by_headroom(
-    state: VehicleState, own: float, faster: float, slowest: int, policy: Policy, now_s: float
-) -> VehicleState:
+def _by_headroom(state: Record, own: float, faster: float, slowest: int, policy: Policy, now_s: float) -> None:
     """The rows of the table that depend on headroom: `own` is h there, and `faster` is h+."""
     last_resort = state.gain_set == slowest and state.mode == _CRITICAL and not state.released
-    pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
-    eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
+    state.pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
+    state.eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
     blending = now_s < state.changed_s + policy.blend_s
-    if not blending and now_s - pressed_s >= policy.hold_s and not state.released:
-        pressed = _with(state, _CRITICAL, inf, inf)
+    if not blending and now_s - state.pressed_s >= policy.hold_s and not state.released:
+        state.mode, state.pressed_s, state.eased_s = _CRITICAL, inf, inf
         if state.gain_set < slowest:
-            return _with_gains(pressed, state.gain_set + 1, now_s)
-        return _released(pressed, True) if policy.act and last_resort else pressed
-    if not blending and now_s - eased_s >= policy.ease_s:
+            _change_gains(state, state.gain_set + 1, now_s)
+        elif policy.act and last_resort:
+            state.mode, state.released = _FAILSAFE, True
+    elif not blending and now_s - state.eased_s >= policy.ease_s and (state.released or state.gain_set > 0):
+        state.eased_s = inf
         if state.released:
-            return _released(_with(state, _FAILSAFE, pressed_s, inf), False)
-        if state.gain_set > 0:
-            return _with_gains(_with(state, _RECOVERING, pressed_s, inf), state.gain_set - 1, now_s)
-    held = _with(state, state.mode, pressed_s, eased_s)
-    return _with(held, _steady_mode(held, own, blending, policy, now_s), pressed_s, eased_s)
+            state.mode, state.released = _FAILSAFE, False
+        else:
+            state.mode = _RECOVERING
+            _change_gains(state, state.gain_set - 1, now_s)
+    else:
+        state.mode = _steady_mode(state, own, blending, policy, now_s)
 
 
 @kernel
-def is_at_ease(state: VehicleState) -> bool:
-    """Whether it is NOMINAL and no timer runs; `state` may be a record."""
+def is_at_ease(state: Record) -> bool:
+    """Whether a vehicle is NOMINAL and no timer runs."""
     return state.mode == _NOMINAL and state.pressed_s == inf and state.eased_s == inf
 
 
 @kernel
-def _steady_mode(state: VehicleState, own: float, blending: bool, policy: Policy, now_s: float) -> Any:
+def _steady_mode(state: Record, own: float, blending: bool, policy: Policy, now_s: float) -> Any:
     """The mode when the gains do not change."""
     fastest, mode = state.gain_set == 0, state.mode
     if state.released:
@@ -178,21 +174,9 @@ def _steady_mode(state: VehicleState, own: float, blending: bool, policy: Policy
 
 
 @kernel
-def _with(state: VehicleState, mode: Any, pressed_s: float, eased_s: float) -> VehicleState:
-    return VehicleState(mode, state.gain_set, state.former_set, state.changed_s, pressed_s, eased_s, state.released)
-
-
-@kernel
-def _with_gains(state: VehicleState, gain_set: int, now_s: float) -> VehicleState:
-    if gain_set == state.gain_set:
-        return state
-    return VehicleState(state.mode, gain_set, state.gain_set, now_s, state.pressed_s, state.eased_s, state.released)
-
-
-@kernel
-def _released(state: VehicleState, released: bool) -> VehicleState:
-    gain_set, former_set = state.gain_set, state.former_set
-    return VehicleState(_FAILSAFE, gain_set, former_set, state.changed_s, state.pressed_s, state.eased_s, released)
+def _change_gains(state: Record, gain_set: int, now_s: float) -> None:
+    if gain_set != state.gain_set:
+        state.gain_set, state.former_set, state.changed_s = gain_set, state.gain_set, now_s
 
 
 @kernel

@@ -1,6 +1,6 @@
 """The monitor turns measured loop delays into modes, and acts before the delay margin is reached.
 
-`gcs.station.modes.monitored` is the whole decision for one vehicle, as a pure function. Gains are blended over time
+`gcs.station.modes.next_state` is the whole decision for one vehicle. Gains are blended over time
 when they change, so that commands do not jump.
 
 As headroom shrinks, the monitor acts in this order:
@@ -126,22 +126,11 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
         own = Observation(
             seen.time_s, seen.flying, seen.silent[row], seen.guided[row], seen.failsafe[row], delay_s
         )  # fmt: skip
-        new.mode, new.gain_set, new.former_set, new.changed_s, new.pressed_s, new.eased_s, new.released = next_state(
-            state_of(state), own, own_s, policy
-        )
+        next_state(new, own, own_s, policy)
         if new.mode != state.mode or new.gain_set != state.gain_set or new.released != state.released:
             watched.changed[found] = row
             found += 1
     return found
-
-
-@kernel
-def state_of(record: Record) -> VehicleState:
-    """A record of STATE as a `VehicleState`, whose mode is a number."""
-    return VehicleState(
-        record.mode, record.gain_set, record.former_set, record.changed_s,
-        record.pressed_s, record.eased_s, record.released,
-    )  # fmt: skip
 
 
 @kernel
@@ -196,9 +185,8 @@ class FormationMonitor:
     ) -> None:
         self._states, self._after = np.zeros(vehicles, STATE), np.zeros(vehicles, STATE)
         self._states[:] = VehicleState()
-        self.modes, self.gain_sets = np.zeros(vehicles, np.int64), np.zeros(vehicles, np.int64)
-        """Those of the vehicles' states, and whether they are released."""
-        self.released = np.zeros(vehicles, np.bool_)
+        self.modes, self.gain_sets, self.released = (self._states[name] for name in ("mode", "gain_set", "released"))
+        """Those of the vehicles' states."""
         self.margins_s = np.tile(margins_s, (vehicles, 1))
         """How much of its loop delay each gain set tolerates, (vehicles, sets)."""
         self.opening = 1.0
@@ -209,8 +197,10 @@ class FormationMonitor:
         self._delays_s = np.full((vehicles, max(1, round(policy.window_s / period_s))), nan)
         self._judged, self._changed = np.zeros(1, np.int64), np.zeros(vehicles, np.int64)
         self._in_order = np.zeros(self._delays_s.shape[1])
-        self._troubled: dict[int, VehicleState] = {}
-        """Those, by row, on whose account the formation may open."""
+        self.away: list[int] = []
+        """The rows of the vehicles that do not follow their commands."""
+        self._troubled: list[int] = []
+        """The rows of those on whose account the formation may open."""
         self.newest_blends, self._settled_s = unblended(vehicles), -inf
         """What `blends` returned last, and when gains stop changing."""
 
@@ -231,8 +221,9 @@ class FormationMonitor:
                 self._after[row] = after
             if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                 changes.append((row, before, after))
-            self._note(row, after)
         settle(self.watched)
+        if changed:
+            self.away, self._troubled, self._settled_s = self._rows(_AWAY), self._rows(_TROUBLED), inf
         self._open(seen.time_s, flying=seen.flying)
         return changes
 
@@ -241,13 +232,9 @@ class FormationMonitor:
         mode, *rest = states[row].item()
         return VehicleState(Mode(mode), *rest)
 
-    def _note(self, row: int, state: VehicleState) -> None:
-        self.modes[row], self.gain_sets[row], self.released[row] = state.mode, state.gain_set, state.released
-        if state.mode in _TROUBLED:
-            self._troubled[row] = state
-        else:
-            self._troubled.pop(row, None)
-        self._settled_s = inf
+    def _rows(self, modes: tuple[Mode, ...]) -> list[int]:
+        """The vehicles in one of these modes."""
+        return np.isin(self.modes, modes).nonzero()[0].tolist()
 
     def blends(self, time_s: float) -> Records:
         """The gains (n, BLEND) that each vehicle is flown with."""
@@ -269,23 +256,17 @@ class FormationMonitor:
             return False
         return not flying or not ((self._keys.act and self._troubled) or self.away)
 
-    @property
-    def away(self) -> list[int]:
-        """The vehicles that do not follow their commands, by row."""
-        return [row for row, state in self._troubled.items() if state.mode in _AWAY]
-
     def _next_to_release(self) -> int:
         """The vehicle that may be released now: the CRITICAL one farthest down the tree; -1 if there is none."""
-        critical = (self._states["mode"] == Mode.CRITICAL) & ~self._states["released"]
+        critical = (self.modes == Mode.CRITICAL) & ~self.released
         return int(critical.nonzero()[0].max(initial=-1))
 
     def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
         slowest = self.margins_s.shape[1] - 1
         settled_s = time_s - self.policy.blend_s  # gives the slowest gains time to take effect
-        wide = self._keys.act and any(
-            s.gain_set == slowest and s.changed_s < settled_s for s in self._troubled.values()
-        )
-        goal = self._keys.open_factor if wide and flying else 1.0
+        changed_s = self._states["changed_s"]
+        late = any(self.gain_sets[row] == slowest and changed_s[row] < settled_s for row in self._troubled)
+        goal = self._keys.open_factor if late and self._keys.act and flying else 1.0
         step = (self._keys.open_factor - 1.0) * self._period_s / self._keys.open_s
         self.opening += min(step, max(-step, goal - self.opening))

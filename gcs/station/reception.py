@@ -135,11 +135,6 @@ class Reception:
             self.telemetry_ns, self._fleet.frame_ned_m, *self._fresh, news, np.zeros(1, np.int64),
         )  # fmt: skip
 
-    def fresh_rtt_s(self) -> FloatArray:
-        """For each vehicle the oldest completed round trip that was not returned before; NaN if there is none."""
-        found_s: FloatArray = take_fresh(*self._fresh)
-        return found_s
-
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
         """Whether a frame claims this id, as in frames, of a vehicle that is known to send from another address."""
         row = self._row.get(system_id_of(datagram.address[2], system_id))

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray, IntArray
 from gcs.control.law import nearest
-from gcs.control.limits import SetPointLimits
-from gcs.control.loop_delay import Repetitions
+from gcs.control.limits import LARGEST_COMMAND_M_S2, shorten
+from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import Moment, Orders
 from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
@@ -21,20 +21,19 @@ from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import HEARTBEAT, SILENCE_S, RemoteVehicle, heartbeats_to, note_requests, set_points_to
+from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
 from gcs.station.monitor import FormationMonitor, Seen
-from gcs.station.reception import Reception
+from gcs.station.reception import Reception, take_fresh
 from gcs.station.tick_rows import Judged, Tick, tick_rows
 from gcs.station.usual import (
     DUE,
     HEARTBEAT_NS,
     SCHEDULE,
-    Due,
     Usual,
     commanded,
     limits_of,
@@ -88,8 +87,8 @@ class Station:
         """See `Reception`."""
         self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
-        self._has_slots = scenario.has_altitude_slots
-        self._limits = SetPointLimits.of(scenario.limits)
+        self._limits = limits_of(plan)
+        self._speed_max_m_s = scenario.limits.speed_max_m_s or LARGEST_COMMAND_M_S2
         period_s, timesync_ns = self._period_ns / NS_PER_S, round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
@@ -106,15 +105,13 @@ class Station:
             "requests_apart_ns": min(self._period_ns // 3, _REQUESTS_APART_NS),
         }.items():  # fmt: skip
             self._schedule[name] = value
-        self._repetitions = Repetitions(rates, n)
-        self._used_s = np.full(n, nan)
-        self._scratch, self._due = new_scratch(n), Columns(np.zeros(1, DUE))
+        self._used_s, self._repeated_ns = np.full(n, nan), np.zeros((2, n), np.int64)
+        self._scratch, self._due = new_scratch(n), np.zeros(1, DUE)
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
         self._tolerated = None if measured else self._tolerances(np.zeros(n))
         """The tolerances of every tick, if they do not depend on a measured delay."""
-        self._judged_by = limits_of(plan, self._limits.acceleration_m_s2, self._repetitions.longest_ns)
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
@@ -163,11 +160,10 @@ class Station:
         monitor, tolerated = self._monitor, self._tolerated
         assert tolerated is not None
         return Usual(
-            self._schedule, self._judged_by, self._reception.tables, self._reception.row_of, self._law,
+            self._schedule, self._limits, self._reception.tables, self._reception.row_of, self._law,
             monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
-            self._critical, monitor.modes, monitor.gain_sets,
-            monitor.released, tolerated[0], self._used_s, self._repetitions.known_ns, self._system_ids, self._targets,
-            HEARTBEAT, *self._scratch,
+            self._critical, tolerated[0], self._used_s, self._repeated_ns, self._system_ids, self._targets,
+            HEARTBEAT, self._scratch,
         )  # fmt: skip
 
     @property
@@ -247,7 +243,8 @@ class Station:
     ) -> Judged:
         return Judged(
             self._system_ids, self._monitor.modes, self._monitor.gain_sets, controls, self._reception.reported, rtt_s,
-            followed, *tolerated, self._repetitions.repeated_s(controls["used_ns"], due_ns),
+            followed, *tolerated,
+            repeated_s(self._repeated_ns, self._limits.repetition_ns, controls["used_ns"], due_ns),
         )  # fmt: skip
 
     def sent(self, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
@@ -261,7 +258,8 @@ class Station:
         whether the formation is broken, and who is back near its place.
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
-        near = nearest(judged.controls, tick.due_ns, judged.reported["down_m"] if self._has_slots else np.empty(0))
+        down_m = judged.reported["down_m"] if self._limits.has_slots else np.empty(0)
+        near = nearest(judged.controls, tick.due_ns, down_m)
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)
@@ -276,14 +274,14 @@ class Station:
 
     def _usual_tick(self, outgoing: Outbox) -> Tick | None:
         """The tick due now if a kernel can do it, else None."""
-        due_ns, due = self.next_tick_ns, self._due
+        due_ns, due = self.next_tick_ns, Columns(self._due)
         if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(due, 1):
             return None
-        _, time_s, *velocity_m_s = (due[name][0] for name in DUE.names or ())
-        done, set_points = usual_set_points(self.usual, Due(True, True, time_s, (velocity_m_s[0], velocity_m_s[1])))
+        done, set_points = usual_set_points(self.usual, self._due)
         if not done:
             return None
-        return self.unjudged(time_s, due_ns, self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing))
+        indices = self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing)
+        return self.unjudged(due["time_s"][0], due_ns, indices)
 
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
@@ -299,12 +297,13 @@ class Station:
         now = Moment(due_ns, time_s, nominal_m_s, self._monitor.opening)
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
         self._fleet.bound(controls, blends)
-        self._limits.limit_commands(controls["command_m_s2"])
+        shorten(controls["command_m_s2"], self._limits.acceleration_m_s2)
         key_ms = self._key_ms(due_ns)
         followed = commanded(controls, self._monitor.released, flying)
         orders = Orders(controls, followed, nominal_m_s, due_ns)
         points = self._fleet.set_points(orders, self.phase)
-        self._limits.limit(points)  # last, so that it holds whoever computed them
+        shorten(points["velocity_ned_m_s"], self._speed_max_m_s)  # last, so that it holds whoever computed them
+        shorten(points["acceleration_ne_m_s2"], self._limits.acceleration_m_s2)
         self._fleet.loop.sent(due_ns, points)
         indices = self._add_set_points(set_points_to(self._fleet.links, points, self._targets, key_ms), outgoing)
         for row in self._in_turn(sorted(self._busy)):
@@ -315,7 +314,8 @@ class Station:
                 self._busy.discard(row)
         tolerated = self._tolerated or self._tolerances(controls["assumed_s"])
         self._monitor.margins_s = tolerated[1]
-        judged = self._judged(controls, self._reception.fresh_rtt_s(), followed, tolerated, due_ns)
+        rtt_s = take_fresh(self._reception.tables.fresh_ns, self._reception.tables.fresh_counts)
+        judged = self._judged(controls, rtt_s, followed, tolerated, due_ns)
         tick = Tick(self._tick_count, time_s, due_ns, key_ms, judged, indices)
         self._tick_count += 1 + behind
         return tick
@@ -353,7 +353,7 @@ class Station:
     def _decide(self, due_ns: int, outgoing: Outbox) -> None:
         """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
-        silent = self._journal.now_ns - self._reception.telemetry_ns > SILENCE_S * NS_PER_S
+        silent = self._journal.now_ns - self._reception.telemetry_ns > self._limits.silence_ns
         self._look_at(self._reception.touched if flying else self._reception.touched | {*self._in_turn(self._rows)})
         self._reception.touched.clear()
         absent = [*self._why_absent] if flying else [""] * len(self.vehicles)

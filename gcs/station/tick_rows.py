@@ -34,7 +34,7 @@ class Judged(NamedTuple):
     """How far the loop delay may be from the assumed delay, (n, sets): see `gcs.plan.mismatch.Tolerated`."""
     longer_s: FloatArray
     repeated_s: FloatArray
-    """See `gcs.control.loop_delay.Repetitions`."""
+    """See `gcs.control.loop_delay.repeated_s`."""
 
 
 class Tick(NamedTuple):

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gcs.control.history import every_at, every_newest
 from gcs.control.law import CONTROL, FeedbackLaw, control_all, nearest
-from gcs.control.limits import any_beyond, shorten
-from gcs.control.loop_delay import repeated_s
+from gcs.control.limits import LARGEST_COMMAND_M_S2, any_beyond, shorten
+from gcs.control.loop_delay import longest_repetition_ns, repeated_s
 from gcs.control.loops import accelerations
 from gcs.link.mavlink import (
     HEARTBEAT_EXTRA,
@@ -48,31 +48,31 @@ SCHEDULE = np.dtype(
     ]
 )  # fmt: skip
 """When a station does what."""
-LIMITS = np.dtype(
-    [
-        ("acceleration_m_s2", "f8"),
-        ("silence_ns", "i8"), ("repetition_ns", "i8"),
-        ("separable", "?"),
-        ("spacing_m", "f8"), ("collision_m", "f8"), ("has_slots", "?"),
-    ],
-    align=True,
-)  # fmt: skip
-"""What a tick is judged by."""
-
-
-def limits_of(plan: FlightPlan, acceleration_m_s2: float, repetition_ns: int) -> Records:
-    """What the ticks of a plan are judged by, LIMITS (1,)."""
-    safety, limits = plan.scenario.safety, np.zeros(1, LIMITS)
-    limits[0] = (
-        acceleration_m_s2, SILENCE_S * NS_PER_S, repetition_ns, plan.separable,
-        SURELY_WITHIN * safety.spacing_error_limit_m, safety.collision_distance_m, plan.scenario.has_altitude_slots,
-    )  # fmt: skip
-    return limits
-
-
 DONE, WITH_TICK, NOT_TAKEN, NOT_DONE, NOT_JUDGED = range(5)
 """How far a step came: it is done; with the rows of its tick; only some of its datagrams are taken in; these are, but
 nothing else is done; it is done but for the rows of its tick, as the formation may be broken."""
+
+
+class TickLimits(NamedTuple):
+    """What a tick is judged by."""
+
+    acceleration_m_s2: float
+    silence_ns: int
+    repetition_ns: int
+    separable: bool
+    spacing_m: float
+    collision_m: float
+    has_slots: bool
+
+
+def limits_of(plan: FlightPlan) -> TickLimits:
+    """What the ticks of a plan are judged by."""
+    scenario, safety = plan.scenario, plan.scenario.safety
+    return TickLimits(
+        scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, round(SILENCE_S * NS_PER_S),
+        longest_repetition_ns(scenario.rates), plan.separable,
+        SURELY_WITHIN * safety.spacing_error_limit_m, safety.collision_distance_m, scenario.has_altitude_slots,
+    )  # fmt: skip
 
 
 class Scratch(NamedTuple):
@@ -95,8 +95,7 @@ class Usual(NamedTuple):
 
     schedule: Records
     """Of SCHEDULE, (1,)."""
-    limits: Records
-    """Of LIMITS, (1,)."""
+    limits: TickLimits
     tables: Tables
     row_of: Ints
     law: FeedbackLaw
@@ -105,34 +104,17 @@ class Usual(NamedTuple):
     policy: Policy
     guided: NDArray[np.bool_]
     critical: NDArray[np.bool_]
-    modes: Ints
-    gain_sets: Ints
-    released: NDArray[np.bool_]
     shorter_s: FloatArray
     used_s: FloatArray
     repeated_ns: Ints
     system_ids: Ints
     targets: Ints
     heartbeat: Bytes
-    controls: Records
-    """This and the rest: see `Scratch`."""
-    points: Records
-    rtt_s: FloatArray
-    silent: NDArray[np.bool_]
+    scratch: Scratch
 
 
 DUE = np.dtype([("flying", "?"), ("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")], align=True)
 """What Python knows of a tick to come: whether the formation is flown, its scenario time, the nominal velocity then."""
-
-
-class Due(NamedTuple):
-    """The same of the tick that is due next, for kernels."""
-
-    is_usual: bool
-    """Whether a kernel may do it, as far as Python knows. If not, nothing else is known."""
-    flying: bool
-    time_s: float
-    nominal_velocity_m_s: tuple[float, float]
 
 
 class Sending(NamedTuple):
@@ -145,12 +127,13 @@ class Sending(NamedTuple):
 
 @array_kernel
 def usual_step(
-    usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Due, rows: Records
+    usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Record, known: bool, rows: Records
 ) -> tuple[int, int, Sending, Sending, Sending]:
     """Do a step at `now_ns` of the schedule as far as it is usual.
 
     Stream, table and `queued_ns` are those of `Arrivals`. Returns how far it came, how many datagrams are taken in, and
-    what is sent, in order. `rows` are those of the tick.
+    what is sent, in order. `due`, of DUE, is the tick that is due next: `known` says whether a kernel may do it, as far
+    as Python knows. If not, nothing else is known of it. `rows` are those of the tick.
     """
     schedule, tables = usual.schedule[0], usual.tables
     nothing, taken = _nothing(), 0
@@ -164,21 +147,21 @@ def usual_step(
         if tables.news[place].kind != ANSWER:
             return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
-        if not due.is_usual or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due):
+        if not known or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due):
             return NOT_DONE, taken, nothing, nothing, nothing
         answers = _answered(tables)
         set_points, judged = _tick(usual, due, rows)
         return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
     answers = _answered(tables)
     heartbeats = requests = nothing
-    known = tables.links
+    links = tables.links
     if schedule.now_ns >= schedule.next_heartbeat_ns:
         schedule.next_heartbeat_ns = schedule.now_ns + HEARTBEAT_NS
-        to = heard(known, np.ones(len(known), np.bool_))
-        frames = same_frames(usual.heartbeat, HEARTBEAT_EXTRA, to, known.sequence)
+        to = heard(links, np.ones(len(links), np.bool_))
+        frames = same_frames(usual.heartbeat, HEARTBEAT_EXTRA, to, links.sequence)
         heartbeats = Sending(frames, np.full(len(to), frames.shape[1]), to)
     if schedule.now_ns >= schedule.next_requests_ns:
-        frames, sizes, to = requested(usual.schedule, known, tables.clocks, tables.pending_ns)
+        frames, sizes, to = requested(usual.schedule, links, tables.clocks, tables.pending_ns)
         requests = Sending(frames, sizes, to)
     return DONE, taken, answers, heartbeats, requests
 
@@ -219,11 +202,10 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 
 @kernel
-def _is_calm(usual: Usual, due: Due) -> bool:
+def _is_calm(usual: Usual, due: Record) -> bool:
     """Whether the monitor has nothing to do but to note delays and times; they are noted only then."""
-    limits, n, judged = usual.limits[0], len(usual.used_s), usual.watched.judged[0]
-    silent = usual.silent
-    for row in range(n):
+    limits, silent, judged = usual.limits, usual.scratch.silent, usual.watched.judged[0]
+    for row in range(len(silent)):
         silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
     seen = Seen(due.time_s, due.flying, silent, usual.guided, usual.critical, usual.used_s)
     if judge(usual.watched, seen, usual.policy, limits.separable) > 0:
@@ -234,35 +216,34 @@ def _is_calm(usual: Usual, due: Due) -> bool:
 
 
 @array_kernel
-def usual_set_points(usual: Usual, due: Due) -> tuple[bool, Sending]:
-    """Decide and command the tick due now; if it is not usual, False and nothing, and nothing is done."""
-    if not _is_calm(usual, due):
+def usual_set_points(usual: Usual, due: Records) -> tuple[bool, Sending]:
+    """Decide and command the tick due now, DUE (1,); if it is not usual, False and nothing, and nothing is done."""
+    if not _is_calm(usual, due[0]):
         return False, _nothing()
-    set_points, _ = _command(usual, due)
+    set_points, _ = _command(usual, due[0])
     return True, set_points
 
 
 @array_kernel
-def _command(usual: Usual, due: Due) -> tuple[Sending, NDArray[np.bool_]]:
+def _command(usual: Usual, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
     """The set-points of the tick due now, and which vehicles are to follow the control law."""
-    schedule, limits, tables, law = usual.schedule[0], usual.limits[0], usual.tables, usual.law
-    controls, points, due_ns = usual.controls, usual.points, schedule.next_tick_ns
+    schedule, limits, tables, law = usual.schedule[0], usual.limits, usual.tables, usual.law
+    controls, points, due_ns = usual.scratch.controls, usual.scratch.points, schedule.next_tick_ns
     ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ones are skipped
     schedule.next_tick_ns = due_ns + ticks * schedule.period_ns
     schedule.tick_count += ticks
-    north_m_s, east_m_s = due.nominal_velocity_m_s
     times_ns, states = every_newest(tables.reports, tables.report_counts)
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
-    control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
+    control_all(controls, law, times_ns, states, seen, usual.blends, due.north_m_s, due.east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    followed = commanded(controls, usual.released, due.flying)
+    followed = commanded(controls, usual.watched.states.released, due.flying)
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
     frames = set_point_frames(points, to, tables.links.sequence, usual.targets, _key_ms(schedule, due_ns))
     rtt_s = take_fresh(tables.fresh_ns, tables.fresh_counts)
     for row in range(len(rtt_s)):
-        usual.rtt_s[row] = rtt_s[row]
+        usual.scratch.rtt_s[row] = rtt_s[row]
     return Sending(frames, np.full(len(to), frames.shape[1]), to), followed
 
 
@@ -273,9 +254,9 @@ def _key_ms(schedule: Record, due_ns: int) -> int:
 
 
 @array_kernel
-def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
+def _tick(usual: Usual, due: Record, rows: Records) -> tuple[Sending, bool]:
     """The tick due now; returns the set-points, and whether the rows are filled, as the formation is not broken."""
-    schedule, limits, tables, controls = usual.schedule[0], usual.limits[0], usual.tables, usual.controls
+    schedule, limits, tables, controls = usual.schedule[0], usual.limits, usual.tables, usual.scratch.controls
     due_ns, number = schedule.next_tick_ns, schedule.tick_count
     set_points, followed = _command(usual, due)
     repeated = repeated_s(usual.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
@@ -288,8 +269,9 @@ def _tick(usual: Usual, due: Due, rows: Records) -> tuple[Sending, bool]:
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
     if due.flying and (closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)):
         return set_points, False
+    states = usual.watched.states
     judged = Judged(
-        usual.system_ids, usual.modes, usual.gain_sets, controls, tables.reported, usual.rtt_s, followed,
+        usual.system_ids, states.mode, states.gain_set, controls, tables.reported, usual.scratch.rtt_s, followed,
         usual.shorter_s, usual.watched.margins_s, repeated,
     )  # fmt: skip
     sent_ns = np.full(len(controls), due_ns)

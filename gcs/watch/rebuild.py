@@ -18,7 +18,7 @@ import numpy as np
 
 from gcs.control.history import StateHistory
 from gcs.control.law import nearest, unblended
-from gcs.control.loop_delay import Repetitions
+from gcs.control.loop_delay import longest_repetition_ns, repeated_s
 from gcs.control.loops import Moment, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
@@ -143,7 +143,7 @@ class _Rebuilding:
         self._scenario, self._outline = scenario, outline
         self._fleet = fleet_of(_plan(scenario, design), ignored)
         ids = self._fleet.plan.formation.system_ids
-        self._repetitions = Repetitions(scenario.rates, len(ids))
+        self._repeated_ns = np.zeros((2, len(ids)), np.int64)
         self.watch = Watch(ids)
         self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
         self._row = {system_id: row for row, system_id in enumerate(ids)}
@@ -283,7 +283,7 @@ class _Rebuilding:
             np.array([self._fresh_rtt_s(row, vehicle) for row, vehicle in enumerate(self._vehicles)]),
             np.array([one is not None for _, one in sent]),
             np.array([own.shorter_s for own in tolerated]), np.array([own.longer_s for own in tolerated]),
-            self._repetitions.repeated_s(controls["used_ns"], due_ns),
+            repeated_s(self._repeated_ns, longest_repetition_ns(self._scenario.rates), controls["used_ns"], due_ns),
         )  # fmt: skip
         number = round((due_ns - self._start_ns) / self._period_ns)
         tick = Tick(number, time_s, due_ns, key_ms, judged, np.empty(0, np.int64))

@@ -9,7 +9,7 @@ from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gcs.control.history import HISTORY, StateHistory
 from gcs.control.law import FeedbackLaw, feedback_law, formation_control, unblended
-from gcs.control.limits import SetPointLimits
+from gcs.control.limits import shorten
 from gcs.plan.formation import Formation
 
 MS = 1_000_000
@@ -108,7 +108,7 @@ def test_command_is_shortened_to_the_limit_and_keeps_its_direction() -> None:
     states = RNG.normal(size=(5, 4)) * 1000
     free = controlled(filled(states))
     held = free.command_m_s2.copy()
-    SetPointLimits(5.0, 9.0).limit_commands(held)
+    shorten(held, 5.0)
     direction = free.command_m_s2 / np.hypot(*free.command_m_s2.T)[:, None]
     assert np.array(held) == pytest.approx(5.0 * direction)
 

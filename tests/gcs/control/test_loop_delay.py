@@ -5,7 +5,7 @@ from math import inf, isnan, nan
 import numpy as np
 import pytest
 
-from gcs.control.loop_delay import Repetitions, headroom, loop_delay_s
+from gcs.control.loop_delay import headroom, longest_repetition_ns, loop_delay_s, repeated_s
 from gcs.link.clocks import LEAST_SAMPLES, VehicleClock
 from scenarios.schema import Rates
 
@@ -29,12 +29,14 @@ def test_headroom_is_what_is_left_of_the_margin() -> None:
 
 
 def test_repetitions_count_only_as_far_as_the_telemetry_rate_explains() -> None:
-    repetitions = Repetitions(Rates(control_hz=50.0, telemetry_hz=10.0), 2)
-    ages_s = [repetitions.repeated_s(np.array([6 * S, 7 * S]), 8 * S + k * 20 * MS)[1] for k in range(8)]
+    longest_ns, known_ns = longest_repetition_ns(Rates(control_hz=50.0, telemetry_hz=10.0)), np.zeros((2, 2), np.int64)
+    used_ns = np.array([6 * S, 7 * S])
+    ages_s = [repeated_s(known_ns, longest_ns, used_ns, 8 * S + k * 20 * MS)[1] for k in range(8)]
     assert ages_s == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08, 0.08, 0.08, 0.08])
-    assert repetitions.repeated_s(np.array([6 * S, 7 * S + 100 * MS]), 9 * S).tolist() == [0.08, 0.0]
-    always_new = Repetitions(Rates(control_hz=50.0, telemetry_hz=50.0), 1)
-    assert always_new.repeated_s(np.array([7 * S]), 9 * S).tolist() == [0.0]
+    newer_ns = np.array([6 * S, 7 * S + 100 * MS])
+    assert repeated_s(known_ns, longest_ns, newer_ns, 9 * S).tolist() == [0.08, 0.0]
+    longest_ns = longest_repetition_ns(Rates(control_hz=50.0, telemetry_hz=50.0))
+    assert repeated_s(known_ns, longest_ns, used_ns, 10 * S).tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(("up_ms", "down_ms"), [(10, 110), (110, 10), (60, 60)])

@@ -31,7 +31,7 @@ _, plan = flight_plan(scenario.model_copy(update=changes))
 prepare(plan)
 before = compiled()
 assert len(before) > 10
-assert "gcs.link.sequence._restart_at" in before  # needed after a long silence only
+assert "gcs.link.sequence.restart_at" in before  # needed after a long silence only
 assert sum(1 for _ in fly_lockstep(plan, vehicles=StepByStep(vehicles_of(plan.scenario)))) > 200  # as in real time
 assert compiled() == before, {name: count for name, count in compiled().items() if before.get(name) != count}
 """

@@ -8,14 +8,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.control.tick import Mode
-from gcs.station.modes import Observation, VehicleState, monitored
+from gcs.station.modes import STATE, Observation, VehicleState, next_state, policy_of
 from gcs.station.monitor import FormationMonitor, Seen
+from scenarios.kernel import at_row
 from scenarios.schema import Monitor
 
 MARGINS_S = (0.3, 0.6, 1.2)
 POLICY = Monitor(caution_headroom=0.3, critical_headroom=0.15, hysteresis=0.05, hold_s=0.3, ease_s=3.0, blend_s=1.0)
 SEEN = Observation(time_s=100.0, flying=True, silent=False, guided=True, failsafe=False, loop_delay_s=0.05)
 NOMINAL = VehicleState(mode=Mode.NOMINAL)
+
+
+next_state_at = at_row(next_state)
+
+
+def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
+    """The state after one tick."""
+    states = np.zeros(1, STATE)
+    states[0] = state
+    next_state_at(states, 0, seen, np.array(margins_s), policy_of(policy))
+    mode, *rest = states[0].item()
+    return VehicleState(Mode(mode), *rest)
 
 
 def with_headroom(headroom: float, gain_set: int = 0) -> float:

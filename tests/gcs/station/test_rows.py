@@ -24,7 +24,8 @@ def two_vehicles() -> tuple[Links, RemoteVehicle]:
 
 def test_every_column_holds_what_its_name_says() -> None:
     links, vehicle = two_vehicles()
-    vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=10 * S)
+    estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=10 * S)
+    links.clocks.known[list(estimate._fields)][1] = estimate
     vehicle.clock.down_ns, vehicle.clock.down_bound_ns = 30_000_000, 4000
     vehicle.clock.loop_bound_ns = 6000.0
     for sequence in (1, 2, 5, 4, 4):
