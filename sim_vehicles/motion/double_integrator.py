@@ -148,17 +148,12 @@ def shifted(state: State, north_m: float, east_m: float, north_m_s: float, east_
 
 
 @kernel
-def pushed(state: State, command: Command, bounds: Bounds, piece: tuple[float, float, float, float, float]) -> State:
-    """The state after an interval of constant push, a `Piece` of `air`, with the command held."""
-    t, half_north, half_east, north, east = piece
-    state = shifted(state, 0.0, 0.0, half_north, half_east)
-    return shifted(advance(state, command, bounds, t), north, east, half_north, half_east)
-
-
-@kernel
 def push_on(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
-    """Move a flying vehicle by an interval of constant push."""
-    set_state(vehicle, pushed(state_of(vehicle), command_of(vehicle), _bounds_of(vehicle), piece))
+    """Move a flying vehicle by an interval of constant push, a `Piece` of `air`."""
+    t, half_north, half_east, north, east = piece
+    state = shifted(state_of(vehicle), 0.0, 0.0, half_north, half_east)
+    state = advance(state, command_of(vehicle), _bounds_of(vehicle), t)
+    set_state(vehicle, shifted(state, north, east, half_north, half_east))
 
 
 @kernel

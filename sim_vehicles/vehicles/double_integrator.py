@@ -126,12 +126,8 @@ class DoubleIntegrator:
             return self._state
         if self._air is None:
             return motion.advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
-        if self._own is not None:
-            return self._own_motion(self._own.foreseen, self._air, time_ns, foreseen=True)
-        state = self._state
-        for piece in self._air.pieces(self._state_ns, time_ns, foreseen=True):
-            state = motion.pushed(state, self._command, self._bounds, piece)
-        return state
+        own = motion.advance if self._own is None else self._own.foreseen
+        return self._moved(own, self._air, time_ns, foreseen=True)
 
     def acts_at(self, time_ns: int) -> int:
         """The instant at which a message that arrives now acts: never before one that has already acted."""
@@ -345,7 +341,7 @@ class DoubleIntegrator:
                 for piece in self._air.pieces(self._state_ns, time_ns):
                     _push_on_at(self._vehicles, self._row, piece)
             else:
-                self._state = self._own_motion(self._own.advance, self._air, time_ns)
+                self._state = self._moved(self._own.advance, self._air, time_ns)
             self._state_ns = time_ns
 
     def push(self, push: Push, time_ns: int) -> None:
@@ -354,12 +350,12 @@ class DoubleIntegrator:
         self.move(time_ns)
         self._air.add(push)
 
-    def _own_motion(self, moved: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
-        """The state at a time by dynamics in place of the double integrator's."""
+    def _moved(self, own: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
+        """The state at a later time in flight, by its own motion and what the air adds."""
         command = self._command
 
         def move(state: State, duration_s: float) -> State:
-            return moved(state, command, self._bounds, duration_s)
+            return own(state, command, self._bounds, duration_s)
 
         return air.moved(self._state, move, motion.shifted, self._state_ns, time_ns, foreseen=foreseen)
 
