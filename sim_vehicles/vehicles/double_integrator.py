@@ -39,8 +39,6 @@ LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
 
 
-_state_at, _set_state_at = at_row(motion.state_of), at_row(motion.set_state)
-_command_at, _set_command_at = at_row(motion.command_of), at_row(motion.set_command)
 _push_on_at, _advance_to_at = at_row(motion.push_on), at_row(motion.advance_to)
 
 
@@ -78,8 +76,7 @@ class DoubleIntegrator:
         self._radio = radio
         self._onboard = onboard
         self._bounds = motion.bounds_of(scenario.limits)
-        for name, bound in self._bounds._asdict().items():
-            self._columns[name][self._row] = bound
+        self._vehicles["bounds"][self._row] = self._bounds
         self._altitude_m = scenario.altitude_of(own)
         self._state = motion.state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
@@ -99,19 +96,19 @@ class DoubleIntegrator:
 
     @property
     def _state(self) -> State:
-        return _state_at(self._vehicles, self._row)
+        return State(*self._vehicles["state"][self._row].tolist())
 
     @_state.setter
     def _state(self, state: State) -> None:
-        _set_state_at(self._vehicles, self._row, state)
+        self._vehicles["state"][self._row] = state
 
     @property
     def _command(self) -> Command:
-        return _command_at(self._vehicles, self._row)
+        return Command(*self._vehicles["command"][self._row].tolist())
 
     @_command.setter
     def _command(self, command: Command) -> None:
-        _set_command_at(self._vehicles, self._row, command)
+        self._vehicles["command"][self._row] = command
 
     @property
     def deadline_ns(self) -> int:
