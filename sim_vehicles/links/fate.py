@@ -1,15 +1,13 @@
 """What decides what happens to a datagram on a link: the link, the time and random draws.
 
-A link's schema is converted once into a frozen `LinkBehaviour`, with all times in ns. Each link has two random streams:
-one decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from
-both, used or not. So more loss leaves the delays unchanged, and one link's traffic does not shift the draws of another.
+Each link has two random streams: one decides loss, duplication and corruption, the other the jitter. Every datagram
+takes the same number of draws from both, used or not. So more loss leaves the delays unchanged, and one link's traffic
+does not shift the draws of another.
 """
 
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,47 +30,7 @@ DRAW = np.dtype(
     ]
 )  # fmt: skip
 """All that is random about one datagram: uniform in [0, 1), except the jitter."""
-
-
-@dataclass(frozen=True, slots=True)
-class LinkBehaviour:
-    """A link's schema with its times as integers of ns."""
-
-    points_ns: tuple[tuple[int, int], ...]
-    """(link time, delay), at least one."""
-    least_delay_ns: int
-    """A lower bound of every datagram's delay."""
-    outages_ns: tuple[tuple[int, int], ...]
-    reordering: bool
-    to_bad: float
-    to_good: float
-    loss_good: float
-    loss_bad: float
-    duplicate: float
-    corrupt: float
-
-    @property
-    def timed(self) -> bool:
-        """Whether the behaviour changes with time."""
-        return len(self.points_ns) > 1 or bool(self.outages_ns)
-
-
-def behaviour_of(link: link_keys.Link) -> LinkBehaviour:
-    points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
-    points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
-    bursts, least_jitter_ns = link.loss_bursts, 0 if link.jitter is None else _ns(link.jitter.least_s)
-    return LinkBehaviour(
-        points_ns=points_ns,
-        least_delay_ns=max(0, min(delay_ns for _, delay_ns in points_ns) + least_jitter_ns),
-        outages_ns=tuple((_ns(outage.from_s), _ns(outage.until_s)) for outage in link.outages),
-        reordering=link.reordering,
-        to_bad=bursts.to_bad_probability if bursts else 0.0,
-        to_good=bursts.to_good_probability if bursts else 1.0,
-        loss_good=bursts.loss_good_probability if bursts else link.loss_probability,
-        loss_bad=bursts.loss_bad_probability if bursts else 0.0,
-        duplicate=link.duplicate_probability,
-        corrupt=link.corrupt_probability,
-    )
+Pairs = Sequence[tuple[int, int]]
 
 
 def constant(link: link_keys.Link) -> bool:
@@ -81,14 +39,16 @@ def constant(link: link_keys.Link) -> bool:
     return link == plain and link.channel is None
 
 
-def in_outage(link: LinkBehaviour, time_ns: int) -> bool:
-    """Whether everything is lost that enters at a link time."""
-    return any(from_ns <= time_ns < until_ns for from_ns, until_ns in link.outages_ns)
+def in_outage(outages_ns: Pairs, time_ns: int) -> bool:
+    """Whether everything is lost that enters at a link time, given (from, until) of each outage."""
+    return any(from_ns <= time_ns < until_ns for from_ns, until_ns in outages_ns)
 
 
-def delay_at(link: LinkBehaviour, time_ns: int) -> int:
-    """The delay without jitter at a link time: linear between points; at a step, the delay after it."""
-    points = link.points_ns
+def delay_at(points: Pairs, time_ns: int) -> int:
+    """The delay in ns without jitter at a link time, given the points (link time, delay) in ns, at least one.
+
+    It is linear between points; at a step, it is the delay after it.
+    """
     if len(points) == 1:
         return points[0][1]
     after = bisect_right(points, time_ns, key=lambda point: point[0])
@@ -125,10 +85,8 @@ def flip(data: NDArray[np.uint8], size: int, flips: NDArray[np.float64], count: 
             data[place // 8] ^= 1 << place % 8
 
 
-class _Delays(Protocol):
-    """Draws the jitter of a number of datagrams and of their duplicates, in s."""
-
-    def __call__(self, count: int) -> Sequence[tuple[float, float]] | NDArray[np.float64]: ...
+_Delays = Callable[[int], Sequence[tuple[float, float]] | NDArray[np.float64]]
+"""Draws the jitter of a number of datagrams and of their duplicates, in s."""
 
 
 class Stream:
@@ -168,7 +126,3 @@ def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _De
         return [(trace_s[k], trace_s[then]) for k, then in pairwise(places)]
 
     return drawn
-
-
-def _ns(time_s: float) -> int:
-    return round(time_s * NS_PER_S)

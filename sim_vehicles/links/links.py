@@ -15,7 +15,7 @@ from scenarios.keys import link as link_keys
 from scenarios.networks import MOST_IN_NETWORK
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links import truth
-from sim_vehicles.links.fate import BLOCK, Stream, behaviour_of, constant, delay_at, flip, flips_of, in_outage
+from sim_vehicles.links.fate import BLOCK, Stream, constant, delay_at, flip, flips_of, in_outage
 from sim_vehicles.links.queue import NOT_READY, Queues, enter_at, has_room, new_queues, take_due_at
 from sim_vehicles.links.truth import DROPPED, DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Recorder, Row
 from sim_vehicles.services.clock import NEVER_NS
@@ -23,8 +23,6 @@ from sim_vehicles.services.draws import Use, seeds_of
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.mavlink import message_id
 
-_BEHAVIOUR = "least_delay_ns", "reordering", "to_bad", "to_good", "loss_good", "loss_bad", "duplicate", "corrupt"
-"""The fields of a `LinkBehaviour` that kernels read from the link's row."""
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
@@ -93,7 +91,7 @@ class Link:
     plain = Cell[bool]()
     """Whether kernels alone can run it: no channel limits it, and it is the same at all times."""
     _drawn, _made = Cell[int](), Cell[int]()
-    _barred = Cell[int]()
+    _barred, _corrupt = Cell[int](), Cell[float]()
 
     def __init__(
         self,
@@ -111,7 +109,9 @@ class Link:
         self.system_id = system_id
         self.zero_ns = NEVER_NS
         """Host time at which the link's own time is 0."""
-        self._behaviour = behaviour_of(link)
+        points_s = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
+        self._points_ns = [(_ns(time_s), _ns(delay_s)) for time_s, delay_s in points_s]
+        self._outages_ns = [(_ns(outage.from_s), _ns(outage.until_s)) for outage in link.outages]
         self._capacity = capacity
         self._channel = channel
         self._queues, self._row = new_queues(1) if queues is None else queues, row
@@ -122,11 +122,19 @@ class Link:
         if channel is not None or not constant(link):
             self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
             self._made = 0
-        own = self._behaviour
-        self._delay_ns = own.points_ns[0][1]
-        values = {"capacity": capacity, "random": self._stream is not None, "delay_ns": self._delay_ns}
-        values |= {"kind": kind, "system_id": system_id, "plain": channel is None and not own.timed}
-        values |= {name: getattr(own, name) for name in _BEHAVIOUR}
+        self._delay_ns = self._points_ns[0][1]
+        least_jitter_ns = 0 if link.jitter is None else _ns(link.jitter.least_s)
+        least_delay_ns = max(0, min(delay_ns for _, delay_ns in self._points_ns) + least_jitter_ns)
+        plain = channel is None and len(self._points_ns) == 1 and not self._outages_ns
+        values = {"kind": kind, "system_id": system_id, "plain": plain}
+        values |= {"capacity": capacity, "random": self._stream is not None, "reordering": link.reordering}
+        values |= {"delay_ns": self._delay_ns, "least_delay_ns": least_delay_ns}
+        values |= {"duplicate": link.duplicate_probability, "corrupt": link.corrupt_probability}
+        loss = link.loss_bursts or link_keys.LossBursts(
+            to_bad_probability=0.0, to_good_probability=1.0, loss_good_probability=link.loss_probability
+        )
+        values |= {"to_bad": loss.to_bad_probability, "to_good": loss.to_good_probability}
+        values |= {"loss_good": loss.loss_good_probability, "loss_bad": loss.loss_bad_probability}
         for name, value in values.items():
             self._columns[name][row] = value
 
@@ -143,10 +151,10 @@ class Link:
         """Take in a datagram that enters the link at `time_ns`."""
         begin_ns = end_ns = time_ns
         delay_ns = self._delay_ns
-        if self._channel is not None or self._behaviour.timed:
+        if not self.plain:
             link_time_ns = time_ns - self.zero_ns
-            delay_ns, self._barred = delay_at(self._behaviour, link_time_ns), PASSED
-            if in_outage(self._behaviour, link_time_ns):
+            delay_ns, self._barred = delay_at(self._points_ns, link_time_ns), PASSED
+            if in_outage(self._outages_ns, link_time_ns):
                 self._barred = truth.OUTAGE
             elif self._channel is not None and self.under_way < self._capacity:
                 sending_ns = self._channel.send(len(data), time_ns)
@@ -202,7 +210,7 @@ class Link:
         if fate & truth.CORRUPTED:
             draws, changed = self._queues.draws[self._row], np.frombuffer(bytearray(data), np.uint8)
             draw = draws[(self._drawn - 1) % len(draws)]
-            flip(changed, len(data), draw["flips"], flips_of(self._behaviour.corrupt, float(draw["corrupt"])))
+            flip(changed, len(data), draw["flips"], flips_of(self._corrupt, float(draw["corrupt"])))
             data = changed.tobytes()
         self._long[self.entered, 0] = data
         if fate & DUPLICATE and not fate & DROPPED:
@@ -288,3 +296,7 @@ class LinkSet:
         if key not in self._channels:
             self._channels[key] = Channel(known)
         return self._channels[key]
+
+
+def _ns(time_s: float) -> int:
+    return round(time_s * NS_PER_S)

@@ -105,37 +105,32 @@ def advance_to(vehicle: Record, time_ns: int) -> None:
 
 @kernel
 def state_of(vehicle: Record) -> State:
-    return State(vehicle.north_m, vehicle.east_m, vehicle.yaw_rad, vehicle.speed_m_s)
+    own = vehicle.state
+    return State(own[0], own[1], own[2], own[3])
 
 
 @kernel
 def set_state(vehicle: Record, state: State) -> None:
-    vehicle.north_m, vehicle.east_m, vehicle.yaw_rad, vehicle.speed_m_s = state
+    own = vehicle.state
+    own[0], own[1], own[2], own[3] = state
 
 
 @kernel
 def command_of(vehicle: Record) -> Command:
-    return Command(
-        vehicle.acceleration_north_m_s2,
-        vehicle.acceleration_east_m_s2,
-        vehicle.velocity_north_m_s,
-        vehicle.velocity_east_m_s,
-        vehicle.velocity_gain_1_s,
-    )
+    own = vehicle.command
+    return Command(own[0], own[1], own[2], own[3], own[4])
 
 
 @kernel
 def set_command(vehicle: Record, command: Command) -> None:
-    vehicle.acceleration_north_m_s2, vehicle.acceleration_east_m_s2 = command[0], command[1]
-    vehicle.velocity_north_m_s, vehicle.velocity_east_m_s = command[2], command[3]
-    vehicle.velocity_gain_1_s = command[4]
+    own = vehicle.command
+    own[0], own[1], own[2], own[3], own[4] = command
 
 
 @kernel
 def _bounds_of(vehicle: Record) -> Bounds:
-    return Bounds(
-        vehicle.speed_min_m_s, vehicle.speed_max_m_s, vehicle.acceleration_max_m_s2, vehicle.turn_rate_max_rad_s
-    )
+    own = vehicle.bounds
+    return Bounds(own[0], own[1], own[2], own[3])
 
 
 @kernel
@@ -148,17 +143,12 @@ def shifted(state: State, north_m: float, east_m: float, north_m_s: float, east_
 
 
 @kernel
-def pushed(state: State, command: Command, bounds: Bounds, piece: tuple[float, float, float, float, float]) -> State:
-    """The state after an interval of constant push, a `Piece` of `air`, with the command held."""
-    t, half_north, half_east, north, east = piece
-    state = shifted(state, 0.0, 0.0, half_north, half_east)
-    return shifted(advance(state, command, bounds, t), north, east, half_north, half_east)
-
-
-@kernel
 def push_on(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
-    """Move a flying vehicle by an interval of constant push."""
-    set_state(vehicle, pushed(state_of(vehicle), command_of(vehicle), _bounds_of(vehicle), piece))
+    """Move a flying vehicle by an interval of constant push, a `Piece` of `air`."""
+    t, half_north, half_east, north, east = piece
+    state = shifted(state_of(vehicle), 0.0, 0.0, half_north, half_east)
+    state = advance(state, command_of(vehicle), _bounds_of(vehicle), t)
+    set_state(vehicle, shifted(state, north, east, half_north, half_east))
 
 
 @kernel

@@ -31,12 +31,8 @@ VEHICLE = np.dtype(
         # FlightMode
         ("armed", "?"), ("flying", "?"), ("mode", "i8"), ("stopped", "i8"), ("deadline_ns", "i8"),
         ("setpoint_ns", "i8"), ("setpoint_timeout_ns", "i8"), ("heartbeat_ns", "i8"), ("heartbeat_timeout_ns", "i8"),
-        # the double integrator: its state at a time, its command and its bounds
-        ("state_ns", "i8"), ("north_m", "f8"), ("east_m", "f8"), ("yaw_rad", "f8"), ("speed_m_s", "f8"),
-        ("acceleration_north_m_s2", "f8"), ("acceleration_east_m_s2", "f8"),
-        ("velocity_north_m_s", "f8"), ("velocity_east_m_s", "f8"), ("velocity_gain_1_s", "f8"),
-        ("speed_min_m_s", "f8"), ("speed_max_m_s", "f8"), ("acceleration_max_m_s2", "f8"),
-        ("turn_rate_max_rad_s", "f8"),
+        # the double integrator: its State at a time, its Command and its Bounds
+        ("state_ns", "i8"), ("state", "f8", (4,)), ("command", "f8", (5,)), ("bounds", "f8", (4,)),
         ("altitude_m", "f8"),
         # counters, until they are added to those of the vehicle
         ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"), ("timesync_replies", "i8"),

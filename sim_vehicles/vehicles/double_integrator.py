@@ -39,8 +39,6 @@ LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
 
 
-_state_at, _set_state_at = at_row(motion.state_of), at_row(motion.set_state)
-_command_at, _set_command_at = at_row(motion.command_of), at_row(motion.set_command)
 _push_on_at, _advance_to_at = at_row(motion.push_on), at_row(motion.advance_to)
 
 
@@ -78,8 +76,7 @@ class DoubleIntegrator:
         self._radio = radio
         self._onboard = onboard
         self._bounds = motion.bounds_of(scenario.limits)
-        for name, bound in self._bounds._asdict().items():
-            self._columns[name][self._row] = bound
+        self._vehicles["bounds"][self._row] = self._bounds
         self._altitude_m = scenario.altitude_of(own)
         self._state = motion.state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
@@ -99,19 +96,19 @@ class DoubleIntegrator:
 
     @property
     def _state(self) -> State:
-        return _state_at(self._vehicles, self._row)
+        return State(*self._vehicles["state"][self._row].tolist())
 
     @_state.setter
     def _state(self, state: State) -> None:
-        _set_state_at(self._vehicles, self._row, state)
+        self._vehicles["state"][self._row] = state
 
     @property
     def _command(self) -> Command:
-        return _command_at(self._vehicles, self._row)
+        return Command(*self._vehicles["command"][self._row].tolist())
 
     @_command.setter
     def _command(self, command: Command) -> None:
-        _set_command_at(self._vehicles, self._row, command)
+        self._vehicles["command"][self._row] = command
 
     @property
     def deadline_ns(self) -> int:
@@ -126,12 +123,8 @@ class DoubleIntegrator:
             return self._state
         if self._air is None:
             return motion.advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
-        if self._own is not None:
-            return self._own_motion(self._own.foreseen, self._air, time_ns, foreseen=True)
-        state = self._state
-        for piece in self._air.pieces(self._state_ns, time_ns, foreseen=True):
-            state = motion.pushed(state, self._command, self._bounds, piece)
-        return state
+        own = motion.advance if self._own is None else self._own.foreseen
+        return self._moved(own, self._air, time_ns, foreseen=True)
 
     def acts_at(self, time_ns: int) -> int:
         """The instant at which a message that arrives now acts: never before one that has already acted."""
@@ -345,7 +338,7 @@ class DoubleIntegrator:
                 for piece in self._air.pieces(self._state_ns, time_ns):
                     _push_on_at(self._vehicles, self._row, piece)
             else:
-                self._state = self._own_motion(self._own.advance, self._air, time_ns)
+                self._state = self._moved(self._own.advance, self._air, time_ns)
             self._state_ns = time_ns
 
     def push(self, push: Push, time_ns: int) -> None:
@@ -354,12 +347,12 @@ class DoubleIntegrator:
         self.move(time_ns)
         self._air.add(push)
 
-    def _own_motion(self, moved: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
-        """The state at a time by dynamics in place of the double integrator's."""
+    def _moved(self, own: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
+        """The state at a later time in flight, by its own motion and what the air adds."""
         command = self._command
 
         def move(state: State, duration_s: float) -> State:
-            return moved(state, command, self._bounds, duration_s)
+            return own(state, command, self._bounds, duration_s)
 
         return air.moved(self._state, move, motion.shifted, self._state_ns, time_ns, foreseen=foreseen)
 

@@ -12,7 +12,7 @@ from scenarios.sockets import Bytes, Ints
 from sim_vehicles.links.links import row_of
 from sim_vehicles.links.queue import copy_bytes, enter, free, new_entry, ready, record_datagram, take, take_in
 from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, PASSED, SAMPLED, can_record, note
-from sim_vehicles.motion.double_integrator import Command, advance_to, set_command
+from sim_vehicles.motion.double_integrator import Command, advance_to, set_command, state_of
 from sim_vehicles.services.clock import NEVER_NS, boot_ns
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.frames import (
@@ -131,7 +131,7 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
         if _must_move(vehicle, time_ns):
             return MOVE_FIRST
         advance_to(vehicle, time_ns)
-    north, east, yaw = vehicle.north_m, vehicle.east_m, vehicle.yaw_rad
+    north, east, yaw, speed = state_of(vehicle)
     heading = _within_half_a_turn(yaw)
     if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
         return UNUSUAL
@@ -143,7 +143,7 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     if REPORTS[k] == HEARTBEAT:
         mode, critical = vehicle.mode, vehicle.stopped != 0
         return heartbeat(vehicle, frame, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
-    v_north, v_east = vehicle.speed_m_s * cos(yaw), vehicle.speed_m_s * sin(yaw)
+    v_north, v_east = speed * cos(yaw), speed * sin(yaw)
     if REPORTS[k] == LOCAL_POSITION:
         note(truth, SAMPLED, vehicle.system_id, boot_ms & UINT32, time_ns, time_ns, time_ns, PASSED, 0)
         return local_position(vehicle, frame, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
