@@ -11,7 +11,7 @@ from gcs.autopilot.kinds import ARM, Seen, kind_of, next_step
 from gcs.autopilot.vehicle_limits import ToldLimits
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
-from gcs.link.startup import OPTIONAL, message_rates
+from gcs.link.startup import OPTIONAL, Startup, message_rates
 from gcs.link.vehicle import ARMED
 
 EARTH_RADIUS_M = 6_378_137.0
@@ -32,15 +32,15 @@ Degrees = tuple[float, float]
 """Latitude and longitude."""
 
 
-class AutopilotStartup:
-    """Start-up of one vehicle, which takes off to `altitude_m`; see `gcs.link.startup.Startup`.
+class AutopilotStartup(Startup):
+    """Start-up of one vehicle, which takes off to `altitude_m`.
 
-    It never arms a vehicle that has been in the air and is on the ground again: people may be beside it.
+    It never arms a vehicle that has been in the air and is on the ground again: people may be beside it. The pilot may
+    take it off again.
     """
 
     def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
         self.kind = UNRECOGNISED
-        self.refusal = ""
         self.altitude_m = altitude_m
         self.relative_altitude_m: float | None = None
         self.airborne = False
@@ -48,9 +48,6 @@ class AutopilotStartup:
         self.origin_altitude_m = 0.0
         """Above sea level; only with an origin."""
         self.limits = ToldLimits()
-        self.has_landed = False
-        """It has been in the air in this flight and is on the ground; the pilot may take it off again."""
-        self.arming_refusals = 0
         self._armed = self._standby = self._has_flown = False
         self._text = ""
         """What it said last."""
