@@ -9,12 +9,12 @@ from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.startup import AutopilotStartup, between
 from gcs.autopilot.vehicle_limits import Bounds
 from gcs.autopilot.velocity_targets import VelocitySetPoint, VelocityTargets
+from gcs.control.fleet import Fleet
 from gcs.control.history import StateHistory
 from gcs.control.loops import Orders
-from gcs.control.manoeuvring import loop_of
 from gcs.control.phases import START_PATIENCE_S, Phase
 from gcs.link import mavlink
-from gcs.link.vehicle import RemoteVehicle, Report, in_words, new_links, refusals
+from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
@@ -27,17 +27,14 @@ _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: an origin that seems to move by less has not moved."""
 
 
-class AutopilotFleet:
-    """See `gcs.station.fleet_kind.FleetKind`."""
+class AutopilotFleet(Fleet):
+    """Multicopters that start on the ground, each in a frame of its own."""
 
     speaks_mavlink_1_first = True
     holds_when_left_alone = False
-    is_usual = False
 
     def __init__(self, plan: FlightPlan, report: Report) -> None:
-        scenario, ids = plan.scenario, plan.formation.system_ids
-        self.plan = plan
-        self.loop = loop_of(plan)
+        scenario = plan.scenario
         self.starts = [
             AutopilotStartup(
                 altitude_m=scenario.altitude_of(vehicle),
@@ -46,22 +43,9 @@ class AutopilotFleet:
             )
             for vehicle in scenario.leader_first()
         ]
-        self.links = new_links(len(ids))
-        self.vehicles = [
-            RemoteVehicle(
-                system_id,
-                startup=startup,
-                report=report,
-                land=scenario.at_end == "land",
-                external=system_id == scenario.external_id,
-                links=self.links,
-                row=row,
-            )
-            for row, (system_id, startup) in enumerate(zip(ids, self.starts, strict=True))
-        ]
-        self.frame_ned_m = np.zeros((len(ids), 3))
+        super().__init__(plan, report, starts=self.starts)
         self._report = report
-        self._lacks = [("", 0)] * len(ids)
+        self._lacks = [("", 0)] * len(self.vehicles)
         """What each vehicle lacks, and since when; 0 once that has been reported."""
         self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
         self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
@@ -121,9 +105,6 @@ class AutopilotFleet:
     def begin(self) -> None:
         for vehicle, startup in zip(self.vehicles, self.starts, strict=True):
             self._report("limits", startup.limits.in_words(), vehicle.system_id)
-
-    def end(self) -> None:
-        """Nothing to report."""
 
     def locate(self, history: StateHistory) -> None:
         """States reported in a frame that has moved since are forgotten."""

@@ -11,7 +11,7 @@ from gcs.autopilot.kinds import ARM, Seen, kind_of, next_step
 from gcs.autopilot.vehicle_limits import ToldLimits
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
-from gcs.link.startup import OPTIONAL, message_rates
+from gcs.link.startup import OPTIONAL, Startup, message_rates
 from gcs.link.vehicle import ARMED
 
 EARTH_RADIUS_M = 6_378_137.0
@@ -32,59 +32,15 @@ Degrees = tuple[float, float]
 """Latitude and longitude."""
 
 
-class _Ground:
-    """What heartbeats, altitudes and texts of one vehicle say about take-off and landing, and its refusals to arm.
+class AutopilotStartup(Startup):
+    """Start-up of one vehicle, which takes off to `altitude_m`.
 
-    The station never arms a vehicle that has been in the air and is on the ground again: people may be beside it.
+    It never arms a vehicle that has been in the air and is on the ground again: people may be beside it. The pilot may
+    take it off again.
     """
-
-    def __init__(self) -> None:
-        self.has_landed = False
-        """It has been in the air in this flight and is on the ground; the pilot may take it off again."""
-        self._armed = self._standby = self._has_flown = False
-        self._altitude_m = 0.0
-        self.arming_refusals = 0
-        """Since it was armed last."""
-        self._text = ""
-
-    def heartbeat(self, fields: tuple[Any, ...]) -> None:
-        _, _, _, base_mode, system_status, _ = fields
-        self._armed, self._standby = bool(base_mode & ARMED), system_status == _STANDBY
-        if self._armed:
-            self.arming_refusals, self._text = 0, ""
-        self._judge()
-
-    def altitude(self, above_home_m: float) -> None:
-        self._altitude_m = above_home_m
-        self._judge()
-
-    def _judge(self) -> None:
-        self._has_flown |= self._armed and self._altitude_m > _HAS_FLOWN_M
-        if not self._armed or self._standby:
-            self.has_landed = self._has_flown
-        elif self._altitude_m > _FLIES_M:
-            self.has_landed = False
-
-    def said(self, text: str) -> bool:
-        """Take in a text from the vehicle; whether it is news. While it is disarmed, it repeats why it does not arm."""
-        known, self._text = not self._armed and text == self._text, text
-        return not known
-
-    @property
-    def does_not_arm(self) -> str:
-        """What a vehicle that is not armed lacks, with the count of its refusals and what it said last."""
-        if not self.arming_refusals:
-            return "does not arm"
-        why = f": {self._text}" if self._text else ""
-        return f"does not arm, refused {self.arming_refusals} times{why}"
-
-
-class AutopilotStartup:
-    """Start-up of one vehicle, which takes off to `altitude_m`; see `gcs.link.startup.Startup`."""
 
     def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
         self.kind = UNRECOGNISED
-        self.refusal = ""
         self.altitude_m = altitude_m
         self.relative_altitude_m: float | None = None
         self.airborne = False
@@ -92,7 +48,9 @@ class AutopilotStartup:
         self.origin_altitude_m = 0.0
         """Above sea level; only with an origin."""
         self.limits = ToldLimits()
-        self._ground = _Ground()
+        self._armed = self._standby = self._has_flown = False
+        self._text = ""
+        """What it said last."""
         self._origin_said = False
         self._sea_level_m = 0.0
         self._flags: int | None = None
@@ -122,7 +80,7 @@ class AutopilotStartup:
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         match msg_id:
             case mavlink.HEARTBEAT:
-                self._ground.heartbeat(fields)
+                self._heartbeat(fields)
             case mavlink.PARAM_VALUE:
                 self.limits.take(fields)
             case mavlink.LOCAL_POSITION_NED:
@@ -142,12 +100,28 @@ class AutopilotStartup:
             case _:
                 pass
 
+    def _heartbeat(self, fields: tuple[Any, ...]) -> None:
+        _, _, _, base_mode, system_status, _ = fields
+        self._armed, self._standby = bool(base_mode & ARMED), system_status == _STANDBY
+        if self._armed:
+            self.arming_refusals, self._text = 0, ""
+        self._judge_ground()
+
+    def _judge_ground(self) -> None:
+        """Judge from the newest heartbeat and altitude whether it has taken off or landed."""
+        above_home_m = self.relative_altitude_m or 0.0
+        self._has_flown |= self._armed and above_home_m > _HAS_FLOWN_M
+        if not self._armed or self._standby:
+            self.has_landed = self._has_flown
+        elif above_home_m > _FLIES_M:
+            self.has_landed = False
+
     def _global(self, fields: tuple[Any, ...]) -> None:
         boot_ms, latitude, longitude, altitude_mm, relative_mm = fields[:5]
         if latitude == longitude == 0:
             return  # sent before a position is known
-        above_home_m = self.relative_altitude_m = relative_mm * 1e-3
-        self._ground.altitude(above_home_m)
+        self.relative_altitude_m = relative_mm * 1e-3
+        self._judge_ground()
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None and not self._origin_said and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
@@ -172,20 +146,14 @@ class AutopilotStartup:
         if command == SET_MESSAGE_INTERVAL and parameters[0] in (mavlink.GPS_GLOBAL_ORIGIN, OPTIONAL):
             self._accepted.add(parameters[0])
         elif command == ARM_DISARM:
-            self._ground.arming_refusals += 1
+            self.arming_refusals += 1
         elif command == TAKE_OFF and repeated:
             self._took_off_ns = now_ns
 
     def is_news(self, text: str) -> bool:
-        return self._ground.said(text)
-
-    @property
-    def has_landed(self) -> bool:
-        return self._ground.has_landed
-
-    @property
-    def arming_refusals(self) -> int:
-        return self._ground.arming_refusals
+        """While it is disarmed, it repeats why it does not arm."""
+        known, self._text = not self._armed and text == self._text, text
+        return not known
 
     @property
     def is_half_way_up(self) -> bool:
@@ -224,7 +192,10 @@ class AutopilotStartup:
             sea_level_m=self._sea_level_m,
         )
         step = next_step(self.kind, seen, altitude_m=self.altitude_m)
-        return step if step.command != ARM else step._replace(missing=self._ground.does_not_arm)
+        if step.command != ARM or not self.arming_refusals:
+            return step
+        why = f": {self._text}" if self._text else ""
+        return step._replace(missing=f"{step.missing}, refused {self.arming_refusals} times{why}")
 
 
 def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:

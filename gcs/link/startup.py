@@ -9,7 +9,6 @@ from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Kind, Step, mode_command
 from gcs.link.upload import Upload
 
-_READY = Step("")
 OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
 """The message without which a vehicle can be flown: prediction then assumes that every set-point acts."""
 WITHOUT_TARGET = "does not report its active target"
@@ -22,34 +21,24 @@ def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:
 
 
 class Startup(Protocol):
-    """The part of the conversation with a vehicle that depends on its kind."""
+    """The part of the conversation with a vehicle that depends on its kind; each kind inherits this."""
 
-    @property
-    def kind(self) -> Kind: ...
-
-    @property
-    def refusal(self) -> str:
-        """Why the vehicle must not be flown; empty if it may."""
-        ...
+    kind: Kind
+    refusal: str = ""
+    """Why the vehicle must not be flown; empty if it may."""
+    has_landed: bool = False
+    """Whether it has been in the air in this flight and is on the ground again."""
+    arming_refusals: int = 0
+    """How often it has refused to arm since it was armed last."""
 
     @property
     def is_half_way_up(self) -> bool:
         """Whether it has climbed to half of its take-off altitude or more."""
-        ...
+        return False
 
-    @property
-    def has_landed(self) -> bool:
-        """Whether it has been in the air in this flight and is on the ground again."""
-        ...
-
-    @property
-    def arming_refusals(self) -> int:
-        """How often it has refused to arm since it was armed last."""
-        ...
-
-    def is_news(self, text: str) -> bool:
+    def is_news(self, text: str) -> bool:  # noqa: ARG002 - most vehicles seldom speak
         """Whether a text from the vehicle is new, not one that it only repeats."""
-        ...
+        return True
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
         """The kind of vehicle, as far as its heartbeats show it."""
@@ -71,12 +60,10 @@ class Startup(Protocol):
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
 
-class LaunchedStartup:
+class LaunchedStartup(Startup):
     """Start-up of a double integrator: telemetry rate, parameters of the loop on board if any, GUIDED, armed."""
 
     kind = LAUNCHED
-    is_half_way_up = has_landed = False
-    arming_refusals = 0
 
     def __init__(
         self, telemetry_hz: float, parameters: dict[str, float] | None = None, *, target_hz: float = 0.0
@@ -86,26 +73,17 @@ class LaunchedStartup:
         """The messages whose rates are settled."""
         self._upload = Upload(parameters or {})
 
-    @property
-    def refusal(self) -> str:
-        return self._upload.refusal
-
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - it is what the scenario says
         return LAUNCHED
-
-    def is_news(self, text: str) -> bool:  # noqa: ARG002 - it seldom speaks
-        return True
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         if msg_id == mavlink.PARAM_VALUE:
             self._upload.take(fields)
+            self.refusal = self._upload.refusal
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
         guided, uploaded = custom_mode == LAUNCHED.guided_mode, self._upload.done
-        asked = len(self._set) == len(self._rates)
-        if asked and clock_known and uploaded and guided and armed:
-            return _READY
-        due = None if asked else next((m, us) for m, us in self._rates.items() if m not in self._set)
+        due = next(((m, us) for m, us in self._rates.items() if m not in self._set), None)
         command = None
         if due is not None:
             command = SET_MESSAGE_INTERVAL, due
@@ -137,43 +115,3 @@ class LaunchedStartup:
     def begin_anew(self) -> None:
         self._set.clear()
         self._upload.begin_anew()
-
-
-class ExternalStartup:
-    """Start-up of a vehicle that somebody else flies: it is asked for messages, and nothing else.
-
-    `own` is the start-up that the station would lead such a vehicle through.
-    """
-
-    def __init__(self, own: Startup) -> None:
-        self._own = own
-        self.recognise, self.take = own.recognise, own.take
-        self.is_news, self.arming_refusals = own.is_news, 0
-        self.accepted, self.refused, self.begin_anew = own.accepted, own.refused, own.begin_anew
-
-    @property
-    def kind(self) -> Kind:
-        return self._own.kind
-
-    @property
-    def refusal(self) -> str:
-        return self._own.refusal
-
-    @property
-    def has_landed(self) -> bool:
-        return self._own.has_landed
-
-    @property
-    def is_half_way_up(self) -> bool:
-        return self._own.is_half_way_up
-
-    def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
-        """What it lacks in order to be followed; its mode and arming are its pilot's."""
-        del custom_mode, armed
-        guided = self._own.kind.guided_mode
-        step = self._own.next(custom_mode=guided, armed=True, clock_known=clock_known, now_ns=now_ns)
-        asks = step.command is not None and step.command[0] == SET_MESSAGE_INTERVAL
-        return step if asks else Step(step.missing)
-
-    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """None: its parameters are its owner's."""

@@ -36,7 +36,7 @@ from gcs.link.kinds import (
 )
 from gcs.link.mavlink import TIMESYNC_FRAME_BYTES, encode_timesync
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter, new_counters
-from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
+from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, Startup
 from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel, kernel
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
@@ -226,7 +226,8 @@ class RemoteVehicle:
     ) -> None:
         self.system_id, self.wire_id = system_id, wire_id(system_id)
         self.external = external
-        """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter."""
+        """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter. It
+        is asked for messages, and nothing else."""
         self._links, self._row = links or new_links(1), row
         self._columns = Columns(self._links.known)
         self.frames = SequenceCounter(self._links.counters, row)
@@ -239,7 +240,7 @@ class RemoteVehicle:
         self.taken_over = False
         """Whether the vehicle's pilot flies it, or its autopilot for a reason of its own. This ends only when it
         reports that it is guided; until then the station asks it for telemetry and commands nothing."""
-        self.startup = ExternalStartup(startup) if external else startup
+        self.startup = startup
         self.kind = startup.kind
         self._launched = not self.kind.piloted
         self._has_been_guided = self._take_off_sent = False
@@ -497,7 +498,9 @@ class RemoteVehicle:
             return None
         frame = self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
-            due = self.startup.next_parameter(now_ns, target_system=self.wire_id, rtt_ns=self.clock.rtt_ns or 0)
+            rtt_ns, due = self.clock.rtt_ns or 0, None
+            if not self.external:
+                due = self.startup.next_parameter(now_ns, target_system=self.wire_id, rtt_ns=rtt_ns)
             idle = due is None and self._command is None and not self.kind.piloted
             self._settled = idle and not self._next_step().missing
             return None if due is None else self.encode(*due)
@@ -541,13 +544,16 @@ class RemoteVehicle:
         return command if command is None or not self.taken_over or command[0] == SET_MESSAGE_INTERVAL else None
 
     def _next_step(self) -> Step:
+        """The next step of the start-up. Of a vehicle flown by somebody else, mode and arming are its pilot's."""
         self._tell_position()
-        return self.startup.next(
-            custom_mode=self.custom_mode,
-            armed=self.armed,
+        step = self.startup.next(
+            custom_mode=self.kind.guided_mode if self.external else self.custom_mode,
+            armed=self.armed or self.external,
             clock_known=self.clock.samples >= LEAST_SAMPLES,
             now_ns=self._now_ns,
         )
+        asks = step.command is not None and step.command[0] == SET_MESSAGE_INTERVAL
+        return Step(step.missing) if self.external and not asks else step
 
     def begin_anew(self) -> None:
         """Set rates and parameters again: the vehicle seems to have restarted.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
+from gcs.control.fleet import Fleet
 from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
@@ -29,7 +30,6 @@ from gcs.link.mavlink import (
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
 from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns
-from gcs.station.fleet_kind import FleetKind
 from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
@@ -103,7 +103,7 @@ def new_reported(n: int) -> Records:
 class Reception:
     """What the vehicles of a fleet have sent. `report` takes events."""
 
-    def __init__(self, fleet: FleetKind, report: Report, *, start_ns: int, period_ns: int) -> None:
+    def __init__(self, fleet: Fleet, report: Report, *, start_ns: int, period_ns: int) -> None:
         self._fleet, self._report = fleet, report
         self._start_ns, self._period_ns = start_ns, period_ns
         n = len(fleet.vehicles)
