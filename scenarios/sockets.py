@@ -112,25 +112,13 @@ class Reader:
         return Batch(stream, table, read_ns, errors)
 
 
-class Writer:
-    """Sends datagrams."""
+def write(stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> tuple[Ints, int, int]:
+    """Send datagrams in order, from these sockets to the addresses with these numbers, or to their peers.
 
-    def __init__(self) -> None:
-        self._words = _words()
-
-    def write(self, stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> "Sent":
-        """Send datagrams in order, from these sockets to the addresses with these numbers, or to their peers."""
-        sent_ns = np.empty(len(begins), np.int64)
-        refused, failed = _write(stream, begins, ends, descriptors, addresses, sent_ns, self._words)
-        return Sent(sent_ns, refused, failed)
-
-
-class Sent(NamedTuple):
-    """When datagrams were handed to the kernel, and how many met a closed port or another error."""
-
-    sent_ns: Ints
-    refused: int
-    failed: int
+    Returns when each was handed to the kernel, how many met a closed port, and how many another error.
+    """
+    sent_ns = np.empty(len(begins), np.int64)
+    return sent_ns, *_write(stream, begins, ends, descriptors, addresses, sent_ns, _words())
 
 
 def realtime_offset_ns() -> int:

@@ -6,7 +6,6 @@ a socket; the station decides nothing in between.
 """
 
 import gc
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -33,7 +32,7 @@ from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Recorder, TruthLog
+from sim_vehicles.links.truth import LINK_UP, Recorder, TruthLog
 
 START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start; not zero, so that a forgotten time is noticed."""
@@ -55,27 +54,7 @@ class Vehicles(Protocol):
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
-class LinkLosses(Recorder):
-    """Counts the datagrams that entered the links and those lost, from the truth that `vehicles_of` records."""
-
-    def __init__(self) -> None:
-        self._entered: Counter[int] = Counter()
-        self._lost: Counter[int] = Counter()
-        super().__init__(self._count)
-
-    def _count(self, records: Records) -> None:
-        for direction in (LINK_UP, LINK_DOWN):
-            own = records["kind"] == direction
-            self._entered[direction] += int(own.sum())
-            self._lost[direction] += int((own & (records["fate"] & DROPPED != 0)).sum())
-
-    def share(self, direction: int) -> float:
-        """Fraction of the datagrams that were lost up (LINK_UP, from vehicles) or down (LINK_DOWN)."""
-        self.flush()
-        return self._lost[direction] / max(self._entered[direction], 1)
-
-
-def vehicles_of(scenario: Scenario, *, recorder: Recorder | None = None) -> Vehicles:
+def vehicles_of(scenario: Scenario, *, recorder: Recorder | None = None) -> Fleet:
     """The simulated vehicles of a scenario and their links, at the start."""
     return Fleet(scenario, START_NS, recorder=recorder)
 

@@ -26,7 +26,7 @@ from gcs.runs.record import MIRROR, RunWriter
 from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.station.station import Station
 from scenarios.networks import LAST_NETWORK
-from scenarios.sockets import Bytes, Ints, Reader, Writer, address_of, number_of, realtime_offset_ns, stamped
+from scenarios.sockets import Bytes, Ints, Reader, address_of, number_of, realtime_offset_ns, stamped, write
 
 _MOST_ADDRESSES = 8192
 """Most addresses that are remembered: anybody may send."""
@@ -96,7 +96,7 @@ class StationSocket:
 
     def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
         self.guard, self.networks = guard, networks
-        self._reader, self._writer, self._addresses = Reader(), Writer(), _Addresses()
+        self._reader, self._addresses = Reader(), _Addresses()
         self._reader.read([])  # so that nothing is compiled in flight
         self._sockets = _bound(host, port, networks)
         self._descriptors = np.zeros(LAST_NETWORK + 1, np.int64)
@@ -167,10 +167,10 @@ class StationSocket:
         )
         begins, ends, keys, _ = signed[1]
         descriptors = self._descriptors[keys >> _NETWORK_BIT]
-        sent = self._writer.write(signed[0], begins, ends, descriptors, keys & _ADDRESS_BITS)
-        self.send_errors += sent.refused + sent.failed  # full buffers and closed ports are losses: links count them
-        table[2], table[3] = self._addresses.numbers(table[2]), sent.sent_ns
-        return Arrivals(stream, table, np.zeros(len(sent.sent_ns), np.int64), self._addresses.known)
+        sent_ns, refused, failed = write(signed[0], begins, ends, descriptors, keys & _ADDRESS_BITS)
+        self.send_errors += refused + failed  # full buffers and closed ports are losses: links count them
+        table[2], table[3] = self._addresses.numbers(table[2]), sent_ns
+        return Arrivals(stream, table, np.zeros(len(sent_ns), np.int64), self._addresses.known)
 
 
 def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:

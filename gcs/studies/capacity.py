@@ -16,7 +16,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
 from gcs.control.tick import TickArray, in_sequence
-from gcs.drive.lockstep import LINK_DOWN, LINK_UP, START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
@@ -173,8 +173,8 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
     _, plan = flight_plan(_displaced(formed))
     if (unstable := unstable_loop(plan)) is not None:
         raise GainsError(unstable)
-    losses = LinkLosses()
-    station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan.scenario, recorder=losses))
+    station, fleet = Station(plan, start_ns=START_NS), vehicles_of(plan.scenario)
+    counted = _Counted(fleet)
     ticks = in_sequence([*fly_lockstep(plan, vehicles=counted, station=station)])
     flown = ticks[ticks["time_s"] >= 0.0]
     commanded = flown[flown["commanded"]]
@@ -190,8 +190,8 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         loop_delay_p99_s=_percentile(commanded["loop_delay_s"], 99),
         headroom_p01=headroom_p01,
         station_bytes_s=counted.bytes_both_ways / float(ticks["time_s"][-1] - ticks["time_s"][0]),
-        lost_up=losses.share(LINK_UP),
-        lost_down=losses.share(LINK_DOWN),
+        lost_up=fleet.lost_share(up=True),
+        lost_down=fleet.lost_share(up=False),
         error_end_m=error_end_m,
         reason=_reason(station.end_reason, error_end_m, headroom_p01),
         holds=completed and error_end_m < _DECAYED * _START_ERROR_M and headroom_p01 is not None and headroom_p01 > 0.0,

@@ -167,6 +167,12 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
+    def lost_share(self, *, up: bool) -> float:
+        """Fraction of the datagrams lost up, from vehicles, or down; those still under way do not count."""
+        links = [member.up if up else member.down for member in self._in_rows]
+        ended = sum(link.entered + link.counts["duplicated"] - link.under_way for link in links)
+        return sum(link.dropped for link in links) / max(ended, 1)
+
     def vehicle(self, system_id: int) -> Shell[DoubleIntegrator | Copter | ExternallyFlown]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle

@@ -15,7 +15,7 @@ import numpy as np
 
 from scenarios.networks import network_of
 from scenarios.schema import NS_PER_S
-from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, Writer, joined, number_of, stamped
+from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, joined, number_of, stamped, write
 from scenarios.undisturbed import undisturbed
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 
@@ -46,7 +46,7 @@ class Sockets:
         """The largest lateness among those counted as `left_late`; a reader may reset it to 0."""
         self._epoll = select.epoll()
         self._sockets: dict[int, socket.socket] = {}
-        self._reader, self._writer = Reader(READ_OF_EACH), Writer()
+        self._reader = Reader(READ_OF_EACH)
         self._woken_ns = time.monotonic_ns()
 
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
@@ -97,10 +97,10 @@ class Sockets:
         """
         begins, ends, descriptors, due_ns = table
         to = np.full(len(due_ns), NO_ADDRESS) if addresses is None else addresses
-        sent = self._writer.write(stream, begins, ends, descriptors, to)
-        self.counters["send_refused"] += sent.refused
-        self.counters["send_failed"] += sent.failed
-        late_ns = sent.sent_ns - due_ns
+        sent_ns, refused, failed = write(stream, begins, ends, descriptors, to)
+        self.counters["send_refused"] += refused
+        self.counters["send_failed"] += failed
+        late_ns = sent_ns - due_ns
         self.counters["left_late"] += int((late_ns > LATE_NS).sum())
         latest_ns = int(late_ns.max(initial=0))
         if latest_ns > LATE_NS:

@@ -257,6 +257,16 @@ class LinkSet:
             self._in_rows += pair
         return self._pairs[system_id]
 
+    @property
+    def next_due_ns(self) -> int:
+        """When the next datagram of any link comes out; NEVER_NS if none is under way."""
+        return int(self.queues.links["next_due_ns"].min())
+
+    def due(self, now_ns: int) -> list[Link]:
+        """The links of which a datagram has come out by now."""
+        due = self.queues.links["next_due_ns"] <= now_ns
+        return [self._in_rows[row] for row in due.nonzero()[0].tolist()]
+
     def draw(self) -> None:
         """Make the next block of draws of each link that has less than a block left."""
         links = self.queues.links

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from scenarios import schema
 from scenarios.networks import MOST_IN_NETWORK
-from sim_vehicles.links.links import Link, LinkSet
+from sim_vehicles.links.links import LinkSet
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Recorder
 from sim_vehicles.services.clock import NEVER_NS
 
@@ -60,8 +60,6 @@ class Relay:
         self._links = LinkSet(scenario, start_ns, recorder=recorder, most=most)
         self._entering: list[Passing] = []
         """Datagrams received later than the last step's now: an earlier one may still be unread."""
-        self._heap: list[tuple[int, int, int]] = []
-        """(due_ns, kind, system id) of each link's next datagram; an entry that its link contradicts is stale."""
 
     @property
     def counters(self) -> Counter[str]:
@@ -70,10 +68,7 @@ class Relay:
     @property
     def next_event_ns(self) -> int:
         """Before this instant `step` returns nothing, unless datagrams arrive."""
-        heap = self._heap
-        while heap and self._link(heap[0][1], heap[0][2]).next_due_ns != heap[0][0]:
-            heapq.heappop(heap)
-        due_ns = heap[0][0] if heap else NEVER_NS
+        due_ns = self._links.next_due_ns
         return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
 
     def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
@@ -87,27 +82,13 @@ class Relay:
                 self.last_heard_ns = max(self.last_heard_ns, time_ns)
                 if self._links.zero_ns == NEVER_NS:
                     self._links.hear(data, time_ns)
-            link = self._link(kind, system_id)
-            before_ns = link.next_due_ns
-            link.send(data, time_ns)
-            if link.next_due_ns != before_ns:
-                heapq.heappush(self._heap, (link.next_due_ns, kind, system_id))
+            up, down = self._links.of(system_id)
+            (up if kind == LINK_UP else down).send(data, time_ns)
         out: list[Passing] = []
-        heap = self._heap
-        while heap and heap[0][0] <= now_ns:
-            due_ns, kind, system_id = heapq.heappop(heap)
-            link = self._link(kind, system_id)
-            if due_ns != link.next_due_ns:
-                continue
+        for link in self._links.due(now_ns):
             for entry in link.due(now_ns):
-                out.append(Passing(entry[0], kind, system_id, entry[3]))
+                out.append(Passing(entry[0], link.kind, link.system_id, entry[3]))
                 if self._recorder is not None:
                     self._recorder.add(link.row(entry, now_ns))
-            if link.next_due_ns != NEVER_NS:
-                heapq.heappush(heap, (link.next_due_ns, kind, system_id))
         out.sort(key=itemgetter(0, 1, 2))
         return out
-
-    def _link(self, kind: int, system_id: int) -> Link:
-        up, down = self._links.of(system_id)
-        return up if kind == LINK_UP else down

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
-from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
@@ -44,6 +43,8 @@ class ExternallyFlown:
         self.version_1_first: bool = craft.version_1_first
         self.intervals_us: Mapping[int, int] = craft.intervals_us
         self.reports_from_ns: int = craft.reports_from_ns
+        self.state_at, self.acts_at, self.move = craft.state_at, craft.acts_at, craft.move
+        self.parameters_set, self.report = craft.parameters_set, craft.report
         self.begin_ns = NEVER_NS
         """When the flight along the course begins; the fleet sets it."""
         self._scenario, self._altitude_m = scenario, altitude_m
@@ -107,15 +108,6 @@ class ExternallyFlown:
 
     # As the station sees it
 
-    def state_at(self, time_ns: int) -> State:
-        return self.craft.state_at(time_ns)
-
-    def acts_at(self, time_ns: int) -> int:
-        return self.craft.acts_at(time_ns)
-
-    def move(self, time_ns: int) -> None:
-        self.craft.move(time_ns)
-
     def hear_heartbeat(self, time_ns: int) -> None: ...  # without effect
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
@@ -129,12 +121,6 @@ class ExternallyFlown:
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
         del mode, time_ns
         return mavlink.DENIED, "is flown by its pilot"
-
-    def parameters_set(self, time_ns: int) -> None:
-        self.craft.parameters_set(time_ns)
-
-    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
-        return self.craft.report(message_id, time_ns, boot_ms)
 
 
 def _command(number: int, param1: float = 0.0, *, altitude_m: float = 0.0) -> mavlink.Command:

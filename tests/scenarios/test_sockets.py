@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scenarios.sockets import NO_ADDRESS, Reader, Writer, address_of, joined, number_of, stamped
+from scenarios.sockets import NO_ADDRESS, Reader, address_of, joined, number_of, stamped, write
 
 
 @pytest.fixture
@@ -36,10 +36,10 @@ def test_what_is_written_is_read_with_its_sender_and_time(two: tuple[socket.sock
     stream, ends = joined(data)
     before_ns = time.monotonic_ns()
     to = np.full(len(data), number_of(other.getsockname()))
-    sent = Writer().write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to)
-    assert (sent.refused, sent.failed) == (0, 0)
-    assert before_ns < sent.sent_ns[0]
-    assert (np.diff(sent.sent_ns) > 0).all()
+    sent_ns, refused, failed = write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to)
+    assert (refused, failed) == (0, 0)
+    assert before_ns < sent_ns[0]
+    assert (np.diff(sent_ns) > 0).all()
     batch = Reader().read([other.fileno(), one.fileno()])
     assert [found.data for found in batch] == data
     assert {(found.descriptor, found.address) for found in batch} == {(other.fileno(), one.getsockname())}
@@ -80,10 +80,12 @@ def test_closed_ports_are_counted_and_do_not_stop_what_follows(two: tuple[socket
     stream, ends = joined([b"anyone?", b"to you"])
     descriptors, to = np.array([one.fileno(), other.fileno()]), np.array([NO_ADDRESS, number_of(other.getsockname())])
     counts = [0, 0]
-    reader, writer = Reader(), Writer()
+    reader = Reader()
     for _ in range(3):
-        counts[0] += writer.write(stream, ends[:-1], ends[1:], descriptors, to).refused
+        _, refused, _ = write(stream, ends[:-1], ends[1:], descriptors, to)
+        counts[0] += refused
         counts[1] += reader.read([one.fileno()]).errors
     assert sum(counts) >= 3
     assert [found.data for found in reader.read([other.fileno()])] == [b"to you"] * 3
-    assert writer.write(stream, ends[:1], ends[1:2], np.array([10_000]), np.array([NO_ADDRESS])).failed == 1
+    _, _, failed = write(stream, ends[:1], ends[1:2], np.array([10_000]), np.array([NO_ADDRESS]))
+    assert failed == 1
