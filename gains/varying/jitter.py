@@ -76,16 +76,14 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     """The spread (s) that the loop tolerates on both sides of a constant delay, however the delay varies within it.
 
     A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards. Jumps
-    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. BadModelError if the
-    matrices do not fit, the mean is negative or not finite, or the rate negative.
+    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. At most the mean is
+    returned; 0 if the loop is unstable at the mean delay. BadModelError if the matrices do not fit, the mean is
+    negative or not finite, or the rate negative.
 
-    With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
-    closed by the integral of C x' between t - mean and t - tau(t), whose gain is at most g times the spread: g = 1 if
-    tau' <= 1 upwards, else sqrt(7/4) (proof in docs/explanation/delay-margin.md). The loop is stable for a spread below
-    1 / (g max over omega of ||D G(j omega) D^{-1}||), for any D. The maximum is read from a fine grid, with a part in a
-    thousand allowed for what lies between: a search, not a proof. If `scaled` is False, D = I and the grid is
-    coarse, for searches that need an estimate quickly. At most the mean is returned; 0 if the loop is unstable at the
-    mean delay.
+    With A1 = B C and G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B the loop is stable for a spread below 1 / (g max over
+    omega of ||D G(j omega) D^{-1}||), for any D; g = 1 if the rate is at most 1, else sqrt(7/4) (proof in
+    docs/explanation/delay-margin.md). The maximum is read from a fine grid, with a part in a thousand allowed for what
+    lies between: a search, not a proof. If `scaled` is False, D = I and the grid is coarse, as a search needs it.
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
