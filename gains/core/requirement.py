@@ -103,7 +103,6 @@ _POSITIVE = (
 
 
 def _check_positive(record: object, names: Iterable[str]) -> None:
-    """Raise BadModelError unless each field is None or a positive number."""
     for name in names:
         wanted = getattr(record, name)
         if wanted is not None and not (np.isfinite(wanted) and wanted > 0):

@@ -113,7 +113,6 @@ class _Parts:
 
     @cached_property
     def norms(self) -> FloatArray:
-        """Spectral norms (terms,)."""
         return np.linalg.norm(self.matrices, 2, axis=(1, 2))
 
     def frequencies(self, highest: float, turn: float = _TURN, per_decade: int = _POINTS_PER_DECADE) -> FloatArray:

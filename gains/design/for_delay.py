@@ -347,7 +347,6 @@ def _best(
 
 
 def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
-    """Whether gains are stable and meet all parts."""
     return _shortfall(figures, parts) == 0.0
 
 

@@ -200,7 +200,6 @@ class _Search:
             self.stable |= zip(small, (radii < 1.0).tolist(), strict=True)
 
     def _is_large(self, delay_s: float) -> bool:
-        """Whether the loop's map has so many states that its spectrum takes too long."""
         return self.loop.states(delay_s) > _LARGEST_CHECK
 
     def _starts(self) -> tuple[FloatArray, FloatArray]:

@@ -32,19 +32,6 @@ _GRID_ERROR = 1e-3
 
 
 @dataclass(frozen=True)
-class Jitter:
-    """An observed effective delay: `mean_s`, the largest distance `spread_s` from it, and the largest |d delay / dt|.
-
-    `rate` (s/s) is inf for a delay that jumps from message to message, as those of queued datagrams do; a sampled and
-    held loop has a sawtooth of rate 1 with jumps. The functions that take a jitter report values out of range.
-    """
-
-    mean_s: float
-    spread_s: float
-    rate: float
-
-
-@dataclass(frozen=True)
 class CoveringBound:
     """Which bound proves the loop stable under an observed jitter."""
 
@@ -56,55 +43,54 @@ class CoveringBound:
     """The largest delay that this bound admits, nan for "none"."""
 
 
-def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
-    """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.
+def bound_covering(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, spread_s: float, rate: float) -> CoveringBound:
+    """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under an observed jitter.
 
-    Arguments as of `gains.varying.bounds.varying_delay_bound`. BadModelError if the matrices do not fit, a block is too
-    large, or the jitter is negative, not a number, or has a spread above the mean.
+    The effective delay is `spread_s` from `mean_s` at most, and |d delay / dt| is `rate` (s/s) at most: inf for a delay
+    that jumps from message to message, as those of queued datagrams do. A sampled and held loop has a sawtooth of rate
+    1 with jumps. A0 and A1 as of `gains.varying.bounds.varying_delay_bound`. BadModelError if the matrices do not fit,
+    a block is too large, or the jitter is negative, not a number, or has a spread above the mean.
 
     x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
 
-    >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.15)]
+    >>> [bound_covering([[0]], [[-1]], mean_s=1.4, spread_s=spread_s, rate=inf).cover for spread_s in (0.0, 0.15)]
     ['constant', 'none']
     """
-    _check(jitter)
-    window = analyse_delay(A0, A1).window_around(jitter.mean_s)
+    _check(mean_s, spread_s, rate)
+    window = analyse_delay(A0, A1).window_around(mean_s)
 
     def bounds() -> Iterator[CoveringBound]:
-        if isfinite(jitter.rate):
-            yield CoveringBound("rate", varying_delay_bound(A0, A1, rate=jitter.rate))
+        if isfinite(rate):
+            yield CoveringBound("rate", varying_delay_bound(A0, A1, rate=rate))
         if window:
-            spread_s = spread_bound(A0, A1, mean_s=jitter.mean_s, rate=jitter.rate)
-            yield CoveringBound("spread", jitter.mean_s + spread_s)
+            yield CoveringBound("spread", mean_s + spread_bound(A0, A1, mean_s=mean_s, rate=rate))
         yield CoveringBound("any", varying_delay_bound(A0, A1, rate=inf))
 
-    uncovered, largest_s = CoveringBound("none", nan), jitter.mean_s + jitter.spread_s
-    if jitter.spread_s == 0.0:
+    uncovered = CoveringBound("none", nan)
+    if spread_s == 0.0:
         return CoveringBound("constant", window[1]) if window else uncovered
-    return next((bound for bound in bounds() if largest_s <= bound.bound_s), uncovered)
+    return next((bound for bound in bounds() if mean_s + spread_s <= bound.bound_s), uncovered)
 
 
 def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf, scaled: bool = True) -> float:
     """The spread (s) that the loop tolerates on both sides of a constant delay, however the delay varies within it.
 
     A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards. Jumps
-    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. BadModelError if the
-    matrices do not fit, the mean is negative or not finite, or the rate negative.
+    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. At most the mean is
+    returned; 0 if the loop is unstable at the mean delay. BadModelError if the matrices do not fit, the mean is
+    negative or not finite, or the rate negative.
 
-    With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
-    closed by the integral of C x' between t - mean and t - tau(t), whose gain is at most g times the spread: g = 1 if
-    tau' <= 1 upwards, else sqrt(7/4) (proof in docs/explanation/delay-margin.md). The loop is stable for a spread below
-    1 / (g max over omega of ||D G(j omega) D^{-1}||), for any D. The maximum is read from a fine grid, with a part in a
-    thousand allowed for what lies between: a search, not a proof. If `scaled` is False, D = I and the grid is
-    coarse, for searches that need an estimate quickly. At most the mean is returned; 0 if the loop is unstable at the
-    mean delay.
+    With A1 = B C and G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B the loop is stable for a spread below 1 / (g max over
+    omega of ||D G(j omega) D^{-1}||), for any D; g = 1 if the rate is at most 1, else sqrt(7/4) (proof in
+    docs/explanation/delay-margin.md). The maximum is read from a fine grid, with a part in a thousand allowed for what
+    lies between: a search, not a proof. If `scaled` is False, D = I and the grid is coarse, as a search needs it.
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
     >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
     [0.5, 0.47]
     """
-    _check(Jitter(mean_s, 0.0, rate))
+    _check(mean_s, 0.0, rate)
     if analyse_delay(A0, A1).window_around(mean_s) is None:
         return 0.0
     gain = 1.0 if rate <= 1.0 else sqrt(7.0 / 4.0)
@@ -113,12 +99,12 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     return min(admitted_s, mean_s)
 
 
-def _check(jitter: Jitter) -> None:
-    seconds("mean_s", jitter.mean_s)
-    if not 0.0 <= jitter.spread_s <= jitter.mean_s:
-        raise BadModelError(f"spread_s is {jitter.spread_s}; 0 to the mean delay of {jitter.mean_s} s is wanted")
-    if not jitter.rate >= 0.0:
-        raise BadModelError(f"rate is {jitter.rate}; a number >= 0 is wanted, inf for jumps")
+def _check(mean_s: float, spread_s: float, rate: float) -> None:
+    seconds("mean_s", mean_s)
+    if not 0.0 <= spread_s <= mean_s:
+        raise BadModelError(f"spread_s is {spread_s}; 0 to the mean delay of {mean_s} s is wanted")
+    if not rate >= 0.0:
+        raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for jumps")
 
 
 def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled: bool) -> float:

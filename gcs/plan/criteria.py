@@ -9,7 +9,7 @@ from gains.core.requirement import plain
 from gains.criteria.bound import alpha_bound
 from gains.criteria.figures import LoopFigures
 from gains.formation.model import FormationModel
-from gains.varying.jitter import Jitter, bound_covering
+from gains.varying.jitter import bound_covering
 from gcs.plan.at_delay import flown_timing
 from gcs.plan.design import CriteriaPart, Design
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -83,8 +83,8 @@ def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> di
             "delays_covered_by": "spread" if is_covered else "none",
             "delays_covered_to_s": middle_s + proved_s if is_covered else None,
         }
-    jitter = Jitter(middle_s + hold_s, spread_s if rate > 0.0 else 0.0, rate)
-    cover = bound_covering(figures.model.A, figures.model.B @ figures.K, jitter)
+    A0, A1, varies_s = figures.model.A, figures.model.B @ figures.K, spread_s if rate > 0.0 else 0.0
+    cover = bound_covering(A0, A1, mean_s=middle_s + hold_s, spread_s=varies_s, rate=rate)
     return {"delays_covered_by": cover.cover, "delays_covered_to_s": plain(cover.bound_s - hold_s)}
 
 

@@ -12,7 +12,7 @@ from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
 from gains.varying.bounds import varying_delay_bound
-from gains.varying.jitter import Jitter, bound_covering, spread_bound
+from gains.varying.jitter import bound_covering, spread_bound
 
 Matrix = NDArray[np.float64]
 A0: Matrix = np.array([[-2.0, 0.0], [0.0, -0.9]])
@@ -115,27 +115,27 @@ def test_sawtooth_beyond_the_constant_margin_is_not_promised() -> None:
 
 
 def test_constant_delay_is_covered_by_the_exact_margin() -> None:
-    verdict = bound_covering(A0, A1, Jitter(mean_s=6.1, spread_s=0.0, rate=0.0))
+    verdict = bound_covering(A0, A1, mean_s=6.1, spread_s=0.0, rate=0.0)
     assert verdict.cover == "constant"
     assert verdict.bound_s == delay_margin(A0, A1)
 
 
 @pytest.mark.slow(first=3)
 @pytest.mark.parametrize(
-    ("jitter", "cover"),
+    ("mean_s", "spread_s", "rate", "cover"),
     [
-        (Jitter(2.0, 0.3, 0.5), "rate"),
-        (Jitter(2.0, 0.05, inf), "spread"),
-        (Jitter(1.0, 1.0, inf), "any"),
-        (Jitter(5.0, 0.8, inf), "none"),
-        (Jitter(6.3, 0.0, 0.0), "none"),
-        (Jitter(6.3, 0.01, 0.1), "none"),
+        (2.0, 0.3, 0.5, "rate"),
+        (2.0, 0.05, inf, "spread"),
+        (1.0, 1.0, inf, "any"),
+        (5.0, 0.8, inf, "none"),
+        (6.3, 0.0, 0.0, "none"),
+        (6.3, 0.01, 0.1, "none"),
     ],
 )
-def test_first_bound_that_covers_a_jitter(jitter: Jitter, cover: str) -> None:
-    verdict = bound_covering(A0, A1, jitter)
+def test_first_bound_that_covers_a_jitter(mean_s: float, spread_s: float, rate: float, cover: str) -> None:
+    verdict = bound_covering(A0, A1, mean_s=mean_s, spread_s=spread_s, rate=rate)
     assert verdict.cover == cover
-    assert isnan(verdict.bound_s) if cover == "none" else jitter.mean_s + jitter.spread_s <= verdict.bound_s
+    assert isnan(verdict.bound_s) if cover == "none" else mean_s + spread_s <= verdict.bound_s
     assert verdict.bound_s <= delay_margin(A0, A1) or isnan(verdict.bound_s)
 
 
@@ -239,9 +239,9 @@ def test_lyapunov_equation_is_solved_where_it_can_be() -> None:
         (lambda: varying_delay_bound(A0, A1, rate=-0.1), "rate is -0.1"),
         (lambda: varying_delay_bound(A0, A1, rate=float("nan")), "rate is nan"),
         (lambda: varying_delay_bound(np.ones((9, 9)), np.eye(9), rate=0.1), "block of 9 states"),
-        (lambda: bound_covering(A0, A1, Jitter(1.0, 2.0, 0.0)), "spread_s is 2.0"),
-        (lambda: bound_covering(A0, A1, Jitter(-1.0, 0.0, 0.0)), "mean_s is -1.0"),
-        (lambda: bound_covering(A0, A1, Jitter(1.0, 0.5, -1.0)), "rate is -1.0"),
+        (lambda: bound_covering(A0, A1, mean_s=1.0, spread_s=2.0, rate=0.0), "spread_s is 2.0"),
+        (lambda: bound_covering(A0, A1, mean_s=-1.0, spread_s=0.0, rate=0.0), "mean_s is -1.0"),
+        (lambda: bound_covering(A0, A1, mean_s=1.0, spread_s=0.5, rate=-1.0), "rate is -1.0"),
     ],
 )
 def test_wrong_questions_are_named(call: Any, message: str) -> None:
