@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from types import FunctionType
-from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, get_args, get_type_hints
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -93,7 +93,6 @@ class _Kernel:
         import numba
         from numba.core import config
 
-        self._refuse_lost_arrays()
         settings: Any = config
         compiler: Any = numba
         folder, before = _cache(settings.CACHE_DIR), settings.CACHE_DIR
@@ -112,13 +111,6 @@ class _Kernel:
             )(self._function)
         finally:
             settings.CACHE_DIR = before
-
-    def _refuse_lost_arrays(self) -> None:
-        """Raise TypeError if arrays are returned to a kernel that counts no references: they would never be freed."""
-        for called in () if self._makes_arrays else self._called():
-            returned = get_type_hints(called._function)["return"]
-            if called._makes_arrays and not {*(get_args(returned) or (returned,))} <= {type(None), bool, int, float}:
-                raise TypeError(f"{self._name} calls {called._name}, which returns arrays, so it is an array_kernel")
 
     def _called(self) -> "list[_Kernel]":
         names, known = self._function.__code__.co_names, self._function.__globals__

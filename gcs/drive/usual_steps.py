@@ -202,7 +202,7 @@ def _step(ends: Any, known: int) -> int:
     now_ns, ticks = state.now_ns, state.ticks
     entered, waiting, leaving = step_all(
         fleet.vehicles, fleet.links, fleet.entries, fleet.frames, fleet.draws, fleet.truth,
-        wire.sent[: state.sent_bytes], _columns(wire.to, state.sent),
+        wire.sent[: state.sent_bytes], wire.to[:, : state.sent].copy(),
         fleet.waiting, fleet.leaving, fleet.leaving_data, 0, now_ns,
     )  # fmt: skip
     if entered < state.sent or waiting or leaving == fleet.leaving.shape[1] or not can_record(fleet.truth):
@@ -224,33 +224,18 @@ def _step(ends: Any, known: int) -> int:
 
 
 @array_kernel
-def _columns(table: Ints, count: int) -> Ints:
-    """A copy of the first columns of a table."""
-    some = np.empty((4, count), np.int64)
-    for part in range(4):
-        for place in range(count):
-            some[part, place] = table[part, place]
-    return some
-
-
-@array_kernel
 def _arrive(wire: Wire, leaving: Ints, data: Bytes, count: int) -> Ints:
     """Let so many datagrams arrive that leave the links, in order of time and row; returns their table."""
-    table = np.empty((4, count), np.int64)
-    _arrive_in(table, wire, leaving, data, np.argsort(leaving[3, :count], kind="mergesort"))
-    return table
-
-
-@kernel
-def _arrive_in(table: Ints, wire: Wire, leaving: Ints, data: Bytes, order: Ints) -> None:
-    state, count = wire.state[0], len(order)
+    state, order = wire.state[0], np.argsort(leaving[3, :count], kind="mergesort")
     before, size = state.arrived_bytes, leaving[1, count - 1] if count else 0
     copy_bytes(wire.arrived, before, data, 0, size)
+    table = np.empty((4, count), np.int64)
     for place in range(count):
         for part in range(4):
             table[part, place] = leaving[part, order[place]] + (before if part < 2 else 0)
             wire.arrivals[part, state.arrived + place] = table[part, place]
     state.in_step, state.arrived, state.arrived_bytes = count, state.arrived + count, before + size
+    return table
 
 
 @kernel

@@ -140,11 +140,6 @@ def in_network(frames: list[Frame], network: int) -> list[Frame]:
     return [frame._replace(system_id=system_id_of(network, frame.system_id)) for frame in frames] if network else frames
 
 
-def first_heartbeats(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The MAVLink 1 heartbeats of a datagram: PX4 sends these until it hears MAVLink 2."""
-    return [frame for frame in decode_1(datagram, refused) if frame.msg_id == HEARTBEAT]
-
-
 def _decode(datagram: bytes, magic: int, refused: Counter[str]) -> list[Frame]:
     frames: list[Frame] = []
     at = 0
@@ -272,17 +267,13 @@ _SET_POINT_EXTRA = CRC_EXTRA[SET_POSITION_TARGET_LOCAL_NED][0]
 HEARTBEAT_EXTRA, _GLOBAL_EXTRA = CRC_EXTRA[HEARTBEAT][0], CRC_EXTRA[GLOBAL_POSITION_INT][0]
 
 
-def _crc_step(crc: int, byte: int) -> int:
-    """CRC-16/MCRF4XX after one more byte."""
-    mixed = (byte ^ crc) & 0xFF
-    mixed = (mixed ^ mixed << 4) & 0xFF
-    return crc >> 8 ^ mixed << 8 ^ mixed << 3 ^ mixed >> 4
-
-
-_CRC = np.array([[_crc_step(0, byte) for byte in range(256)]] * 4, np.uint16)
-"""Row k: what a byte with k more behind it adds to the checksum. Short numbers: a kernel holds them as text."""
-for _further in range(1, 4):
-    _CRC[_further] = _CRC[_further - 1] >> 8 ^ _CRC[0, _CRC[_further - 1] & 0xFF]
+_CRC, _rest = np.empty((4, 256), np.uint16), np.arange(256)
+"""Row k: what a byte with k more behind it adds to the checksum, CRC-16/MCRF4XX with its polynomial 0x8408. Short
+numbers: a kernel holds them as text."""
+for _row in _CRC:
+    for _bit in range(8):
+        _rest = _rest >> 1 ^ 0x8408 * (_rest & 1)
+    _row[:] = _rest
 
 
 @kernel
@@ -348,41 +339,29 @@ def _put_float(data: Array, place: int, value: float) -> None:
     _put(data, place, np.uint64(np.float32(value).view(np.uint32)), 4)
 
 
-@kernel
-def _encode_set_point(data: Array, points: Records, row: int, key_ms: int, target: int, sequence: int) -> None:
-    """Write the frame of a set-point into an array of zeros of its length; its last byte is the frame, never zero."""
-    point = points[row]
-    data[0], data[1], data[4], data[5], data[6] = (
-        MAGIC,
-        _SET_POINT_BYTES,
-        sequence,
-        STATION_SYSTEM_ID,
-        STATION_COMPONENT_ID,
-    )
-    data[7] = SET_POSITION_TARGET_LOCAL_NED
-    _put(data, _HEADER_BYTES, np.uint64(key_ms), 4)
-    for k in range(3):
-        _put_float(data, _HEADER_BYTES + 4 * (4 + k), point.velocity_ned_m_s[k])
-    for k in range(2):
-        _put_float(data, _HEADER_BYTES + 4 * (7 + k), point.acceleration_ne_m_s2[k])
-    end = _HEADER_BYTES + _SET_POINT_BYTES
-    _put(data, end - 5, np.uint64(point.type_mask), 2)
-    data[end - 3], data[end - 2], data[end - 1] = target, 1, _LOCAL_FRAME
-    _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
-
-
 @array_kernel
 def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> NDArray[np.uint8]:
     """The frames (m, bytes) of the set-points of some vehicles, each numbered in a sequence of its own.
 
     `points` (SET_POINT), `sequences` and `targets` (their ids in frames) are those of all vehicles; `sequences` is
-    advanced.
+    advanced. The last byte of a payload is the frame, never zero, so all are of one length.
     """
-    frames = np.zeros((len(rows), _OVERHEAD + _SET_POINT_BYTES), np.uint8)
+    end = _HEADER_BYTES + _SET_POINT_BYTES
+    frames = np.zeros((len(rows), end + 2), np.uint8)
     for place in range(len(rows)):
-        row = rows[place]
+        row, data = rows[place], frames[place]
+        point = points[row]
         sequences[row] = (sequences[row] + 1) & 0xFF
-        _encode_set_point(frames[place], points, row, key_ms, targets[row], sequences[row])
+        data[0], data[1], data[4] = MAGIC, _SET_POINT_BYTES, sequences[row]
+        data[5], data[6], data[7] = STATION_SYSTEM_ID, STATION_COMPONENT_ID, SET_POSITION_TARGET_LOCAL_NED
+        _put(data, _HEADER_BYTES, np.uint64(key_ms), 4)
+        for k in range(3):
+            _put_float(data, _HEADER_BYTES + 4 * (4 + k), point.velocity_ned_m_s[k])
+        for k in range(2):
+            _put_float(data, _HEADER_BYTES + 4 * (7 + k), point.acceleration_ne_m_s2[k])
+        _put(data, end - 5, np.uint64(point.type_mask), 2)
+        data[end - 3], data[end - 2], data[end - 1] = targets[row], 1, _LOCAL_FRAME
+        _put(data, end, np.uint64(checksum(data, 1, end, _SET_POINT_EXTRA)), 2)
     return frames
 
 

@@ -183,8 +183,8 @@ class Reception:
     def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:
         """Take in one datagram, whatever it holds."""
         if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
-            # once answered in MAVLink 2, the vehicle uses that
-            frames = mavlink.first_heartbeats(datagram.data, self.counters)
+            # PX4 sends heartbeats in MAVLink 1 until it is answered in MAVLink 2
+            frames = [one for one in mavlink.decode_1(datagram.data, self.counters) if one.msg_id == HEARTBEAT]
         else:
             frames = mavlink.decode(datagram.data, self.counters)
         for frame in mavlink.in_network(frames, datagram.address[2]):

@@ -45,7 +45,6 @@ PARSERS: dict[str, Callable[[bytes], object]] = {
     "station": lambda data: mavlink.decode(data, Counter()),
     "station, MAVLink 1": lambda data: mavlink.decode_1(data, Counter()),
     "monitor and mirror": lambda data: mavlink.decode_either(data, Counter()),
-    "station's first heartbeats": lambda data: mavlink.first_heartbeats(data, Counter()),
     "end of a frame anywhere": lambda data: [mavlink.frame_end(data, at) for at in range(len(data) + 2)],
     "telemetry log": lambda data: (parse_tlog(data), parse_tlog(bytes(8) + data)),
     "vehicle": lambda data: vehicles_mavlink.read_datagram(data, Counter()),

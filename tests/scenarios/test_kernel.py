@@ -1,0 +1,61 @@
+"""Kernels that count no references to arrays are returned none, which would never be freed."""
+
+import gc
+import pkgutil
+from collections.abc import Iterator
+from importlib import import_module
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from gains.core.arrays import FloatArray
+from scenarios.kernel import array_kernel, kernel
+
+NUMBERS = {type(None), bool, int, float}
+
+
+def kernels() -> list[Any]:
+    return [each for each in gc.get_objects() if type(each).__name__ == "_Kernel"]
+
+
+def lost_arrays(caller: Any) -> Iterator[str]:
+    """The kernels whose new arrays would be lost in one that calls them."""
+    for called in () if caller._makes_arrays else caller._called():
+        returned = get_type_hints(called._function)["return"]
+        if called._makes_arrays and not {*(get_args(returned) or (returned,))} <= NUMBERS:
+            yield f"{caller._name} calls {called._name}"
+
+
+def test_no_arrays_are_returned_to_a_kernel_that_counts_no_references() -> None:
+    for package in ("gcs", "scenarios", "sim_vehicles"):
+        for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
+            import_module(module.name)
+    ours = [each for each in kernels() if each._name.startswith(("gcs.", "scenarios.", "sim_vehicles."))]
+    assert len(ours) > 100
+    assert [lost for each in ours for lost in lost_arrays(each)] == []
+
+
+@array_kernel
+def zeros(n: int) -> FloatArray:
+    return np.zeros(n)
+
+
+@array_kernel
+def size_of_zeros(n: int) -> int:
+    return len(zeros(n))
+
+
+@kernel
+def wrong(n: int) -> int:
+    return len(zeros(n))
+
+
+@kernel
+def right(n: int) -> int:
+    return size_of_zeros(n)
+
+
+@pytest.mark.parametrize(("caller", "lost"), [(wrong, 1), (right, 0), (size_of_zeros, 0)])
+def test_a_kernel_that_would_lose_arrays_is_found(caller: Any, lost: int) -> None:
+    assert len([*lost_arrays(caller)]) == lost
