@@ -54,8 +54,9 @@ class Repetitions:
     """How long each vehicle's set-points have repeated the same state because telemetry is slower than control."""
 
     def __init__(self, rates: Rates, vehicles: int) -> None:
-        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
-        self.longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
+        faster_hz = max(rates.control_hz, rates.telemetry_hz)
+        self._step_ns = round(NS_PER_S / faster_hz)
+        self.longest_ns = self._longest_ns(faster_hz / rates.telemetry_hz)
         self.known_ns = np.zeros((2, vehicles), np.int64)
         """For each vehicle the instant of the state used last, and the tick that used it first."""
 
@@ -63,6 +64,18 @@ class Repetitions:
         """Times from the first tick that used each state to the tick due now, at most one period of the telemetry."""
         repeated: FloatArray = repeated_s(self.known_ns, self.longest_ns, used_ns, due_ns)
         return repeated
+
+    def seen_s(self, received_ns: int, due_ns: int, interval_ns: int = 0) -> float:
+        """The same for an onlooker who knows no ticks: of a state received at an instant, if a tick is due now.
+
+        Vehicles that no station has asked yet may send states at longer intervals than the scenario's.
+        """
+        longest_ns = max(self.longest_ns, self._longest_ns(interval_ns / self._step_ns))
+        return min((due_ns - received_ns) // self._step_ns * self._step_ns, longest_ns) * 1e-9
+
+    def _longest_ns(self, ticks: float) -> int:
+        """The longest repetition, for so many ticks from state to state."""
+        return max(0, ceil(ticks * (1.0 - _SAME_RATE)) - 1) * self._step_ns
 
 
 @array_kernel

@@ -152,7 +152,7 @@ class _Rebuilding:
         self._fleet = fleet_of(_plan(scenario, design), ignored)
         ids = self._fleet.plan.formation.system_ids
         self._repetitions = Repetitions(scenario.rates, len(ids))
-        self.watch = Watch(ids)
+        self.watch = Watch(ids, scenario.rates)
         self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
         self._row = {system_id: row for row, system_id in enumerate(ids)}
         for vehicle, remote in zip(self._vehicles, self._fleet.vehicles, strict=True):
