@@ -123,6 +123,7 @@ def result_of(
 
     With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, or was predicted
     and not found.
+    A sweep of which every trial was aborted fails, too.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
@@ -138,6 +139,7 @@ def result_of(
             for each in onsets
             if each.difference is not None and abs(each.difference) > allowed
         )
+    failure = "; ".join(filter(None, (failure, _nothing_measured(sweep))))
     return CampaignResult(
         scenario=study.plan.scenario.name,
         delay_margin_s=design.delay_margin_s,
@@ -170,6 +172,13 @@ def result_of(
             machine=f"{platform.system()} {platform.machine()}",
         ),
     )
+
+
+def _nothing_measured(sweep: Sequence[Outcome]) -> str:
+    """That every trial of a sweep was aborted, and why; empty if one was not."""
+    if not sweep or any(outcome.verdict != "aborted" for outcome in sweep):
+        return ""
+    return f"nothing was measured: all {len(sweep)} trials were aborted, the first: {sweep[0].reason}"
 
 
 def _noise(outcomes: Sequence[Outcome]) -> Noise:

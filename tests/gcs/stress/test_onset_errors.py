@@ -1,15 +1,25 @@
 """What an onset says that is not known well, or that no link delay reaches; and a sweep that measures nothing."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
-from gcs.stress.study import NoOnset, Study, find_onset
+from gcs.plan.design import Design
+from gcs.stress.measure import fly_trial
+from gcs.stress.report import CampaignResult, result_of
+from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from gcs.stress.trial import Outcome, Trial
 from scenarios.keys.link import Link, Links
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 
+MARGIN_S = 0.5
 STUDY = Study(pair_plan())
+
+
+def result(found: Onset | None, *, sweep: Sequence[Outcome] = (), allowed: float | None = 0.05) -> CampaignResult:
+    design = Design(delay_margin_s=MARGIN_S)
+    return result_of(STUDY, design, sweep, axes=[], sweep=sweep, onset=found, allowed=allowed)
 
 
 @pytest.mark.parametrize(
@@ -35,3 +45,19 @@ def test_an_onset_that_waiting_exceeds_is_not_a_link_delay(waiting_s: float, spr
     study = replace(STUDY, plan=replace(STUDY.plan, scenario=lossy, delay_margin_s=block_s))
     with pytest.raises(NoOnset, match=said):
         find_onset(study, lambda trials: [fly(trial) for trial in trials], tolerance=0.05)
+
+
+def aborted(trial: Trial) -> Outcome:
+    """The outcome of a trial whose vehicles hear nothing."""
+    deaf = Links(up=Link(loss_probability=1.0), down=Link(loss_probability=1.0))
+    return fly_trial(replace(trial, scenario=trial.scenario.model_copy(update={"links": deaf})))
+
+
+def test_a_sweep_that_only_aborts_fails_and_says_why() -> None:
+    sweep = [aborted(STUDY.trial(kind, {"delay": 0.0}, seed=7)) for kind in ("probe", "own")]
+    assert [own.verdict for own in sweep] == ["aborted", "aborted"]
+    assert [(own.loop_delay_s, own.waiting_s, own.predicted_growth_1_s) for own in sweep] == [(None, None, None)] * 2
+    told = result(None, sweep=sweep, allowed=None)
+    assert not told.passed
+    assert told.failure == f"nothing was measured: all 2 trials were aborted, the first: {sweep[0].reason}"
+    assert result(None, sweep=[replace(sweep[0], verdict="stable"), sweep[1]], allowed=None).passed
