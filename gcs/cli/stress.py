@@ -78,7 +78,7 @@ def stress(
         float | None,
         typer.Option(
             metavar="FRACTION",
-            help="exit with code 1 if onset and margin differ by more; implies --onset",
+            help="exit with code 1 if onset and margin differ by more, or the error is larger; implies --onset",
         ),
     ] = None,
     allow_code: options.AllowCode = False,

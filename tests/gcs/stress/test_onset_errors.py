@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from gcs.plan.design import Design
+from gcs.stress.disturbance import DisturbanceOnset, missed
 from gcs.stress.measure import fly_trial
 from gcs.stress.report import CampaignResult, result_of
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
@@ -17,9 +18,46 @@ MARGIN_S = 0.5
 STUDY = Study(pair_plan())
 
 
+def onset(difference: float, error: float) -> Onset:
+    """An onset by its difference and its standard error, both as shares of the margin."""
+    at_s = MARGIN_S * (1.0 + difference)
+    return Onset(
+        loop_delay_s=at_s, error_s=error * MARGIN_S, predicted_s=MARGIN_S, predicted_continuous_s=None,
+        difference=difference, link_delay_s=at_s - 0.01, waiting_s=0.01, slope_1_s2=1.0, frequency_rad_s=None, probed=2,
+        critical=2, rounds=1, flights=(), checks=(), vehicle=None, link_delay_left_s=None, loop=(2,), own=(),
+    )  # fmt: skip
+
+
 def result(found: Onset | None, *, sweep: Sequence[Outcome] = (), allowed: float | None = 0.05) -> CampaignResult:
     design = Design(delay_margin_s=MARGIN_S)
     return result_of(STUDY, design, sweep, axes=[], sweep=sweep, onset=found, allowed=allowed)
+
+
+@pytest.mark.parametrize(
+    ("difference", "error", "said"),
+    [
+        (0.034, 0.178, "± 0.08900 s, an error of 17.800% of the margin 0.50000 s; 5% is allowed"),
+        (0.06, 0.178, "+6.000% from the margin 0.50000 s; 5% is allowed"),
+        (0.04, 0.04, ""),
+    ],
+)
+def test_an_onset_is_asserted_no_finer_than_it_is_known(difference: float, error: float, said: str) -> None:
+    found = result(onset(difference, error))
+    assert found.passed == (not said)
+    assert found.failure.endswith(said)
+    assert found.failure.count("\n") == 0
+
+
+def test_a_disturbance_is_asserted_no_finer_than_it_is_known() -> None:
+    def found(error: float, difference: float = 0.0) -> DisturbanceOnset:
+        return DisturbanceOnset(
+            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0, onset_1_s=2.0 * (1.0 + difference),
+            error_1_s=2.0 * error, difference=difference, flights=3,
+        )  # fmt: skip
+
+    assert missed([found(0.04), found(0.04)], 0.05) is None
+    assert missed([found(0.06), found(0.04)], 0.05) == "1 of 2 onsets are known less well than to 5.000% of the radius"
+    assert missed([found(0.0, 0.06)], 0.05) == "1 of 1 onsets are farther than 5.000% from the radius"
 
 
 @pytest.mark.parametrize(
