@@ -83,6 +83,10 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     _print_noise(console, result.noise)
     if points := [point for point in points if point.kind == "probe"] or points:
         console.print(table_of(points[:MOST_ROWS], _columns(list(points[0].coordinates)), dense=True))
+    aborted = [own for own in result.points if own.verdict == "aborted"]
+    if 0 < len(aborted) < len(result.points):
+        first = f"the first, {aborted[0].id[:_ID]}: {aborted[0].reason}"
+        console.print(f"aborted  {len(aborted)} of {len(result.points)} trials, {first}", markup=False)
     for failed in result.trials_failed:
         fault = (failed.error or "").strip().splitlines()[-1]
         console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {fault}")
@@ -164,7 +168,8 @@ def _reason(reflown: Reflown) -> str | None:
 def checks_of(result: CampaignResult) -> list[Check]:
     """One check that onset and margin agree, and one for every trial that could not be flown."""
     skipped = "" if result.failure or result.assert_onset is not None else "--assert-onset was not given"
-    agrees = Check("the onset is where the margin says", failure=result.failure or "", skipped=skipped)
+    name = "the onset is where the margin says" if result.assert_onset is not None or skipped else "the sweep was flown"
+    agrees = Check(name, failure=result.failure or "", skipped=skipped)
     return [agrees, *(Check(f"trial {outcome.id}", error=outcome.error or "") for outcome in result.trials_failed)]
 
 

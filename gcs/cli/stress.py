@@ -76,7 +76,10 @@ def stress(
     real_time: Annotated[bool, typer.Option("--real-time", help="fly over UDP on the real clock")] = False,
     assert_onset: Annotated[
         float | None,
-        typer.Option(metavar="FRACTION", help="exit with code 1 if onset and margin differ by more; implies --onset"),
+        typer.Option(
+            metavar="FRACTION",
+            help="exit with code 1 if onset and margin differ by more, or the error is larger; implies --onset",
+        ),
     ] = None,
     allow_code: options.AllowCode = False,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
@@ -96,7 +99,8 @@ def stress(
 
     Simulated autopilots fly in virtual time, after they have shown their response, which the margin includes.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, or a trial flown again differs.
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, or a trial flown again
+    differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]

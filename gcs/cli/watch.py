@@ -59,6 +59,9 @@ def monitor(
     sends no heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without
     any exchange, delays are measured against the fastest frames, which makes them lower bounds.
 
+    The loop delay is that of gcs fly, over all phases of its control tick. Without SCENARIO the rates are unknown: then
+    the time for which a position is repeated counts as well.
+
     An ArduPilot sends no position until it is asked. --request asks each vehicle for LOCAL_POSITION_NED, at the
     telemetry rate of the scenario or 10 a second; a vehicle that obeys another station may refuse.
 
@@ -86,7 +89,7 @@ def monitor(
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
         position_hz = scenario.rates.telemetry_hz if scenario else _POSITION_HZ
-        watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
+        watch = Watch((vehicle.system_id for vehicle in scenario.vehicles), scenario.rates) if scenario else Watch()
         recorder = LinkRecorder(watch) if save_links is not None else None
         with stop_signals() as stop_reason:
             report = watch_links(

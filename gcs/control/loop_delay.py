@@ -49,10 +49,27 @@ def headroom(delay_s: float, delay_margin_s: float) -> float:
     return -inf if delay_margin_s <= 0 else 1.0 - delay_s / delay_margin_s
 
 
-def longest_repetition_ns(rates: Rates) -> int:
-    """How long set-points repeat the same state at most because telemetry is slower than control."""
-    ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
-    return max(0, ticks) * round(NS_PER_S / rates.control_hz)
+def longest_repetition_ns(rates: Rates, interval_ns: int = 0) -> int:
+    """How long set-points repeat the same state at most because telemetry is slower than control.
+
+    States come at the scenario's rate, or at `interval_ns` if that is longer.
+    """
+    step_ns = _step_ns(rates)
+    ticks = max(max(rates.control_hz, rates.telemetry_hz) / rates.telemetry_hz, interval_ns / step_ns)
+    return max(0, ceil(ticks * (1.0 - _SAME_RATE)) - 1) * step_ns
+
+
+def repeated_since_s(rates: Rates, received_ns: int, due_ns: int, interval_ns: int = 0) -> float:
+    """How long a state received at an instant has been repeated (s) if a tick is due now, as an onlooker sees it.
+
+    Vehicles that no station has asked yet may send states at longer intervals than the scenario's.
+    """
+    step_ns = _step_ns(rates)
+    return min((due_ns - received_ns) // step_ns * step_ns, longest_repetition_ns(rates, interval_ns)) * 1e-9
+
+
+def _step_ns(rates: Rates) -> int:
+    return round(NS_PER_S / max(rates.control_hz, rates.telemetry_hz))
 
 
 @array_kernel

@@ -108,8 +108,8 @@ def find_disturbance_onsets(
     """Fly the worst disturbances around the stability radii, of the errors of the first `counts` vehicles.
 
     By default these are one follower with the leader, and the whole formation. Relative to the radius, `tolerance` is
-    half the range of the sizes flown in a round, `allowed` the largest distance of an onset from it. `ended` is called
-    after each flight. Raises InputError if the scenario's loop has no such radii.
+    half the range of the sizes flown in a round, `allowed` the largest distance of an onset from it, and its largest
+    standard error. `ended` is called after each flight. Raises InputError if the scenario's loop has no such radii.
     """
     probe, delay_s = _probe(plan)
     onsets = tuple(
@@ -117,11 +117,19 @@ def find_disturbance_onsets(
     )
     failure = None
     if allowed is not None:
-        off = [o for o in onsets if o.difference is None or abs(o.difference) > allowed]
-        failure = f"{len(off)} of {len(onsets)} onsets are farther than {allowed:.3%} from the radius" if off else None
+        failure = missed(onsets, allowed)
     return DisturbanceResult(
         scenario=plan.scenario.name, loop_delay_s=delay_s, onsets=onsets, assert_onset=allowed, failure=failure
     )
+
+
+def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
+    """How many onsets are too far from the radius, or not known well enough to tell; None if none is."""
+    off = [o for o in onsets if o.difference is None or abs(o.difference) > allowed]
+    rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * o.radius_1_s]
+    reasons = (off, "farther than {} from the radius"), (rough, "known less well than to {} of the radius")
+    told = [f"{len(own)} of {len(onsets)} onsets are {why.format(f'{allowed:.3%}')}" for own, why in reasons if own]
+    return "; ".join(told) or None
 
 
 def refusal(scenario: Scenario) -> str | None:

@@ -92,7 +92,10 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     ages_s = _ages_s(plan, flown)
     loop = critical_block(plan_loops(plan), delays_s, ages_s)
     loop_s, link_s, _ = _delays_of(plan, loop, delays_s, outcome)
-    outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s, loop_delay_s=round(loop_s, 9))
+    outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s)
+    if not _is_commanded(flown, loop):
+        return outcome
+    outcome = replace(outcome, loop_delay_s=round(loop_s, 9))
     outcome = _with_prediction(outcome, plan, loop, delays_s, ages_s)
     start_s = _BEGUN_LOOP_DELAYS * loop_s
     growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
@@ -114,7 +117,8 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     probed = next(loop for loop in loops if loop.kind == critical.kind) if trial.probe == CRITICAL else critical
     waiting_s = _delays_of(base, critical, delays_s, outcome)[2] % critical.timing.step_s
     up, down = links = base.scenario.link_of(critical.system_ids[0])
-    outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=round(waiting_s, 9))
+    known_s = round(waiting_s, 9) if _is_commanded(fresh, critical) else None
+    outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=known_s)
 
     def respond(amplitude: float) -> FreeResponse:
         ids, run = probed.system_ids, _folder_of(folder, amplitude)
@@ -132,7 +136,8 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     probed = _loop_of(plan_loops(base), delays_s, trial.probe, _ages_s(base, calm.ticks))
     _, link_s, waiting_s = _delays_of(base, probed, delays_s, outcome)
     past = free_response.past_limits(base.scenario, chosen(calm.ticks, calm.ticks["commanded"]))
-    outcome = replace(outcome, link_delay_s=link_s, waiting_s=round(waiting_s, 9), past_limits=past)
+    known_s = round(waiting_s, 9) if _is_commanded(calm.ticks, probed) else None
+    outcome = replace(outcome, link_delay_s=link_s, waiting_s=known_s, past_limits=past)
 
     def respond(amplitude: float) -> FreeResponse:
         run = _folder_of(folder, amplitude)
@@ -169,6 +174,8 @@ def _with_response(
         outcome = _with_growth(loop, response, outcome)
         if outcome.growth_1_s is not None:
             outcome = replace(outcome, verdict="unstable" if outcome.growth_1_s > 0.0 else "stable")
+        elif outcome.verdict != "aborted":
+            outcome = replace(outcome, verdict="unknown")
         # a flight that never left the linear range has infinity for both
         if not _left_linear_range_too_soon(outcome) or response.until_s >= _CALM_SHARE * response.calm_until_s:
             break
@@ -189,6 +196,11 @@ def _named_vehicle(loop: CoupledBlock, loop_delay_s: Mapping[int, float], outcom
     if outcome.probe in loop.system_ids and _is_varied(outcome.probe, outcome.coordinates):
         return outcome.probe
     return max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
+
+
+def _is_commanded(rows: TickArray, loop: CoupledBlock) -> bool:
+    """Whether these rows have commands of all vehicles of a loop, without which none of its delays is known."""
+    return bool(np.isin(loop.system_ids, rows["system_id"][rows["commanded"]]).all())
 
 
 def _delays_of(
@@ -246,7 +258,10 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     delays_s = response.loop_delays_s(window, loop.system_ids)
     spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
     loop_s = round(delays_s[_named_vehicle(loop, delays_s, outcome)], 9)
-    outcome = replace(_with_fit(outcome, growth), loop_delay_s=loop_s, loop_delay_spread_s=round(spread_s, 9))
+    outcome = replace(_with_fit(outcome, growth), loop_delay_spread_s=round(spread_s, 9))
+    if response.flight.truth is not None and min(delays_s.values()) == 0.0:  # too few of its commands arrived
+        return outcome
+    outcome = replace(outcome, loop_delay_s=loop_s)
     return _with_prediction(outcome, response.plan, loop, delays_s, _ages_s(response.plan, window))
 
 

@@ -122,7 +122,9 @@ def result_of(
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
 
     With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, or was predicted
-    and not found.
+    and not found. It fails as well if the standard error of an onset is more than this fraction of the margin: such
+    flights do not tell whether the onset is that close. The error is not added to the difference, so an onset that is
+    known this well is judged by what was measured. A sweep of which every trial was aborted fails, too.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
@@ -132,12 +134,8 @@ def result_of(
     if allowed is not None and missing is not None and not missing.as_predicted:
         failure = str(missing)
     elif allowed is not None:
-        failure = "; ".join(
-            f"the onset is at {each.loop_delay_s:.5f} s of loop delay, {each.difference:+.3%} from the margin "
-            f"{each.predicted_s:.5f} s; {100.0 * allowed:.3g}% is allowed"
-            for each in onsets
-            if each.difference is not None and abs(each.difference) > allowed
-        )
+        failure = "; ".join(filter(None, (_missed(each, allowed) for each in onsets)))
+    failure = "; ".join(filter(None, (failure, _nothing_measured(sweep))))
     return CampaignResult(
         scenario=study.plan.scenario.name,
         delay_margin_s=design.delay_margin_s,
@@ -170,6 +168,25 @@ def result_of(
             machine=f"{platform.system()} {platform.machine()}",
         ),
     )
+
+
+def _missed(onset: Onset, allowed: float) -> str:
+    """Why an onset is not known to be as close to its margin as is allowed; empty if it is."""
+    if onset.difference is None or onset.predicted_s is None:
+        return ""
+    at, margin = f"the onset is at {onset.loop_delay_s:.5f} s of loop delay", f"the margin {onset.predicted_s:.5f} s"
+    limit = f"{100.0 * allowed:.3g}% is allowed"
+    if abs(onset.difference) > allowed:
+        return f"{at}, {onset.difference:+.3%} from {margin}; {limit}"
+    share = onset.error_s / onset.predicted_s
+    return f"{at} ± {onset.error_s:.5f} s, an error of {share:.3%} of {margin}; {limit}" if share > allowed else ""
+
+
+def _nothing_measured(sweep: Sequence[Outcome]) -> str:
+    """That every trial of a sweep was aborted, and why; empty if one was not."""
+    if not sweep or any(outcome.verdict != "aborted" for outcome in sweep):
+        return ""
+    return f"nothing was measured: all {len(sweep)} trials were aborted, the first: {sweep[0].reason}"
 
 
 def _noise(outcomes: Sequence[Outcome]) -> Noise:

@@ -30,6 +30,7 @@ _LARGEST_ERROR = 0.1
 """Standard error of an onset, as a share of the prediction, above which none was measured."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
+_AT_ONCE = "the formation breaks without any link delay"
 
 
 @dataclass(frozen=True)
@@ -194,12 +195,21 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         centre_s += float(np.clip(ahead_s, -2.0 * width_s, 2.0 * width_s))
         if abs(ahead_s) < width_s:
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
-    raise _not_located(list(flights.values()), zero if scatters else None)
+    raise _not_located(list(flights.values()), zero if scatters else None, shorter=shorter)
 
 
-def _not_located(flights: Sequence[Outcome], scattered: Zero | None) -> NoOnset:
+def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:
+    """That waiting alone takes longer than the loop delay of the onset."""
+    what = "no link delay is short enough to break the formation" if shorter else _AT_ONCE
+    at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
+    return NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
+
+
+def _not_located(flights: Sequence[Outcome], scattered: Zero | None, *, shorter: bool) -> NoOnset:
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
     flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
+    if not shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) > 0.0 for own in flights):
+        return NoOnset(f"{_AT_ONCE}: errors grow {flown}")
     if scattered is not None:
         at = f"{scattered.varied:.3f} s ± {scattered.error:.3f} s of loop delay"
         return NoOnset(f"growth rates scatter too much {flown}: they pass zero at {at}")
@@ -279,6 +289,9 @@ def _found(
     rounds: int,
     shorter: bool,
 ) -> Onset:
+    waiting_s = _waiting_s(near)
+    if zero.varied < waiting_s:
+        raise _unreached(zero, waiting_s, shorter=shorter)
     study, vehicle, blocks = slowed.study, slowed.vehicle, plan_loops(slowed.study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.varied))
     assert nearest.probed is not None
@@ -294,8 +307,7 @@ def _found(
         predicted_s, continuous_s = (
             _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")
         )
-    waiting_s = _waiting_s(near)
-    link_s = max(0.0, zero.varied - waiting_s)
+    link_s = zero.varied - waiting_s
     seed = study.plan.scenario.seed
     at_onset = slowed.at(round(link_s, 6))
     others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]

@@ -61,7 +61,8 @@ class Trial:
 class Outcome:
     """The outcome of a trial: one row of the campaign's table. None where a value is unknown or does not apply.
 
-    `verdict` is that of the whole flight for an own trial, and the sign of the growth rate for a probe. `probed` is the
+    `verdict` is that of the whole flight for an own trial. For a probe it is the sign of the growth rate; without one,
+    "aborted" if the flight was, else "unknown", also where its errors broke a limit. `probed` is the
     first vehicle of the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as
     long for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see
     `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.

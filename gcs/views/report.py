@@ -230,8 +230,13 @@ def flight_lines(summary: Summary) -> dict[str, str]:
     """What is said of a flight as a whole, by its headings; `verdict` without the verdict itself."""
     flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
     lines = {"verdict": f"{_reason(summary)}{flown}", "delay": delay_text(summary)}
-    if summary.at_loop_delay.alpha is not None:
+    if summary.verdict == "unstable" and (summary.headroom_end or 0.0) >= 0.0:
+        lines["delay"] += "; set-points that were lost do not show in it"
+    if (alpha := summary.at_loop_delay.alpha) is not None:
         lines["alpha"] = figures_text(summary.at_loop_delay)
+        if summary.verdict == "unstable":  # what the model says of errors is not what they did
+            at = ms_text(summary.at_loop_delay.loop_delay_s)
+            lines["alpha"] = f"{alpha:.4f} by the model of small errors at {at} of loop delay, the largest median"
     if modes := _modes_text(summary):
         lines["modes"] = modes
     if summary.code:

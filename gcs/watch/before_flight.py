@@ -36,7 +36,7 @@ class _Measurement:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self.watch = Watch(vehicle.system_id for vehicle in scenario.vehicles)
+        self.watch = Watch((vehicle.system_id for vehicle in scenario.vehicles), scenario.rates)
         self.recorder = LinkRecorder(self.watch)
         self.patience_s = patience_s(scenario) + MEASURED_S
         self._complete_ns = 0

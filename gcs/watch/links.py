@@ -5,6 +5,12 @@ Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `g
 A TIMESYNC exchange counts no matter who asked: this watch, or a ground station whose requests are on the same stream.
 Before the first exchange the vehicle's clock is unknown. Delays are then measured against the fastest of the last
 frames, which makes them lower bounds.
+
+Each look counts as a control tick of a station here. What such a station would not count as loop delay, because
+telemetry is slower than control, is left out here too (`gcs.control.loop_delay.repeated_s`). Until a station asks,
+vehicles send states at a rate of their own: what they are slower than the scenario's telemetry is left out as well.
+Without the scenario no rates are known, and nothing is left out. With loops on board, the delays are those of a
+vehicle's own states, not of the oldest that its command needs.
 """
 
 from array import array
@@ -15,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gcs.control.loop_delay import headroom, loop_delay_s
+from gcs.control.loop_delay import headroom, loop_delay_s, repeated_since_s
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
@@ -24,7 +30,7 @@ from gcs.link.vehicle import RemoteVehicle
 from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
-from scenarios.schema import NS_PER_S
+from scenarios.schema import NS_PER_S, Rates
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
@@ -80,12 +86,14 @@ class WatchReport(Published):
     stations: tuple[int, ...]
     refused: dict[str, int]
     vehicles: tuple[LinkFigures, ...]
+    scenario_telemetry_hz: float | None = None
+    """None without a scenario."""
 
 
 class WatchedVehicle:
     """One vehicle as an onlooker sees it: what it sent, and how late it arrived."""
 
-    def __init__(self, system_id: int) -> None:
+    def __init__(self, system_id: int, rates: Rates | None = None) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
         self.remote.goal = None  # nothing is wanted of it
         self.rtt_s = array("d")
@@ -101,6 +109,9 @@ class WatchedVehicle:
         """When the newest one was received."""
         self.boot_ns = 0
         """When it was sampled, on the vehicle's clock."""
+        self._interval_ns = 1 << 62
+        """The shortest between two states, on the vehicle's clock: losses do not lengthen it."""
+        self._rates = rates
         self._kind = mavlink.GLOBAL_POSITION_INT
         self._least_since_ns = 0
         self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
@@ -121,6 +132,8 @@ class WatchedVehicle:
             for looks in (self.age_s, self.loop_delay_s):
                 looks[self._judged :] = array("d", [nan]) * (len(looks) - self._judged)
         self._judged = len(self.age_s)
+        if self.states and boot_ns > self.boot_ns:
+            self._interval_ns = min(self._interval_ns, boot_ns - self.boot_ns)
         self.first_state_ns = self.first_state_ns if self.states else received_ns
         self.states += 1
         self.state_ns, self.boot_ns = received_ns, boot_ns
@@ -133,18 +146,24 @@ class WatchedVehicle:
         """Least reception time minus boot time among the last frames: clock offset plus the least delay."""
         return min(self._least_ns)
 
-    def look(self, now_ns: int) -> None:
-        """Note how old the newest state is, and how late a command computed from it would act."""
+    def look(self, now_ns: int, *, asked: bool = True) -> None:
+        """Note how old the newest state is, and how late a command computed from it would act.
+
+        `asked` says whether a station may have asked for the scenario's telemetry.
+        """
         clock = self.remote.clock
-        age_s, down_s, sampled_ns = nan, 0.0, 0
+        age_s, down_s, sampled_ns, repeated_s = nan, 0.0, 0, 0.0
         if self.states:
+            if self._rates is not None:
+                interval_ns = 0 if asked else self._interval_ns
+                repeated_s = repeated_since_s(self._rates, self.state_ns, now_ns, interval_ns)
             sampled_ns = self.boot_ns + self.least_delay_ns
             if clock.samples:
                 sampled_ns = clock.estimate.to_station_ns(self.boot_ns)
                 down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
             age_s = (now_ns - sampled_ns) * 1e-9
         self.age_s.append(age_s)
-        self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s))
+        self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s, repeated_s))
 
     def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> LinkFigures:
         """The figures of the whole time, or of the last so many looks."""
@@ -193,8 +212,10 @@ class WatchedVehicle:
 class Watch:
     """All vehicles of a stream. Those in `system_ids` are expected; others are added when their heartbeat is heard."""
 
-    def __init__(self, system_ids: Iterable[int] = ()) -> None:
-        self.vehicles = {system_id: WatchedVehicle(system_id) for system_id in system_ids}
+    def __init__(self, system_ids: Iterable[int] = (), rates: Rates | None = None) -> None:
+        self.rates = rates
+        """Those of the scenario; None if it is not known."""
+        self.vehicles = {system_id: WatchedVehicle(system_id, rates) for system_id in system_ids}
         self.stations: set[int] = set()
         """System ids of the ground stations on the stream."""
         self.counters: Counter[str] = Counter()
@@ -249,7 +270,7 @@ class Watch:
             self._looks += 1
             self._look_ns = now_ns + round(SAMPLE_NS * (0.5 + self._looks * _GOLDEN % 1.0))
             for vehicle in self.vehicles.values():
-                vehicle.look(now_ns)
+                vehicle.look(now_ns, asked=bool(self.stations))
         return self._look_ns
 
     def figures(self, now_ns: int, design: "Design | None", last: int = 0) -> list[LinkFigures]:
@@ -266,7 +287,7 @@ class Watch:
             self.stations.add(frame.system_id)
         if autopilot == _NO_AUTOPILOT or frame.component_id != _AUTOPILOT:
             return None
-        return self.vehicles.setdefault(frame.system_id, WatchedVehicle(frame.system_id))
+        return self.vehicles.setdefault(frame.system_id, WatchedVehicle(frame.system_id, self.rates))
 
     def _note_request(self, ts1_ns: int, time_ns: int) -> None:
         self._asked.setdefault(ts1_ns, time_ns)

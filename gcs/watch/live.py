@@ -62,6 +62,7 @@ def watch_links(
             stations=tuple(sorted(watch.stations)),
             refused=dict(watch.counters),
             vehicles=tuple(watch.figures(now_ns, design, last)),
+            **({} if watch.rates is None else {"scenario_telemetry_hz": watch.rates.telemetry_hz}),
         )
 
     with live_display(shown=shown, transient=True) as live:

@@ -144,7 +144,7 @@ class _Rebuilding:
         self._fleet = fleet_of(_plan(scenario, design), ignored)
         ids = self._fleet.plan.formation.system_ids
         self._repeated_ns = np.zeros((2, len(ids)), np.int64)
-        self.watch = Watch(ids)
+        self.watch = Watch(ids, scenario.rates)
         self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
         self._row = {system_id: row for row, system_id in enumerate(ids)}
         for vehicle, remote in zip(self._vehicles, self._fleet.vehicles, strict=True):

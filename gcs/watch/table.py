@@ -13,19 +13,22 @@ from gcs.watch.links import LOWER_BOUND, LinkFigures, WatchReport
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
 NOT_ASKED = "many autopilots send none until a station asks; --request asks"
+RATES_UNKNOWN = "no scenario, so no rates: repetition of a position counts as loop delay"
+_SLOW = 0.9
+"""Telemetry below this share of the scenario's rate is said to be slow."""
 _USUAL, _WIDE = 73, 140
 """Widths of terminals from which more columns are shown."""
 
 
 def render(report: WatchReport, *, width: int, height: int | None = None) -> RenderableType:
     """The whole display, in at most `height` lines: as many of the worst vehicles as fit, and how many do not."""
-    vehicles = report.vehicles
-    room = len(vehicles) if height is None else max(1, height - 7)
+    vehicles, notes = report.vehicles, [*_without_position(report), *_of_rates(report)]
+    room = len(vehicles) if height is None else max(1, height - 6 - max(1, len(notes)))
     if len(vehicles) > room:
         vehicles = sorted(sorted(vehicles, key=_badness)[: max(1, room - 1)], key=lambda figures: figures.system_id)
     table = links_table(vehicles, width) if vehicles else Text("no vehicle heard", "bold red")
     hidden = len(report.vehicles) - len(vehicles)
-    return Group(_headline(report), table, *not_shown(hidden), *_without_position(report), _footer(report))
+    return Group(_headline(report), table, *not_shown(hidden), *notes, _footer(report))
 
 
 def plain_line(report: WatchReport) -> str:
@@ -89,6 +92,19 @@ def _without_position(report: WatchReport) -> list[Text]:
         return []
     why = "asked for, but not sent yet" if report.sent.get("SET_MESSAGE_INTERVAL") else NOT_ASKED
     return [Text(f"no position from {' '.join(without)}: {why}", "yellow")]
+
+
+def _of_rates(report: WatchReport) -> list[Text]:
+    """That the telemetry is slower than the scenario's, or that this is not known."""
+    if (wanted_hz := report.scenario_telemetry_hz) is None:
+        return [] if report.delay_margin_s is None else [Text(RATES_UNKNOWN, "yellow")]
+    slow = {v.system_id: v.telemetry_hz for v in report.vehicles if (v.telemetry_hz or wanted_hz) < _SLOW * wanted_hz}
+    if not slow:
+        return []
+    unasked = f" until a station asks; loop delays are for {wanted_hz:g} Hz"
+    effect = f", not {wanted_hz:g} Hz: the difference counts as loop delay" if report.stations else unasked
+    slowest_hz = min(filter(None, slow.values()))
+    return [Text(f"positions at {slowest_hz:.3g} Hz from {' '.join(map(str, slow))}{effect}", "yellow")]
 
 
 def _footer(report: WatchReport) -> Text:

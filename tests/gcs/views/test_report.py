@@ -4,6 +4,7 @@ from gcs import fly_virtual
 from gcs.views.report import flight_lines
 from scenarios.files import load
 from scenarios.keys.link import Link, Links, Outage, VehicleLinks
+from scenarios.schema import Control, FixedGains, Rates
 from scenarios.shipped import located
 
 
@@ -31,3 +32,18 @@ def test_margins_of_single_vehicles_are_not_taken_for_those_of_slower_gains() ->
 def test_a_flight_in_hand_throughout_says_nothing_of_modes() -> None:
     calm = load(located("chain3")).model_copy(update={"duration_s": 5.0})
     assert "modes" not in flight_lines(fly_virtual(calm).summary)
+
+
+def test_a_flight_that_broke_is_not_told_that_errors_do_not_grow() -> None:
+    """Of the set-points 70 % are lost, which the station cannot see: by what it measures, much headroom is left."""
+    calm, lossy = Link(delay_s=0.02), Link(delay_s=0.02, loss_probability=0.7)
+    chain = load(located("chain3"))
+    safety = chain.safety.model_copy(update={"setpoint_timeout_s": 100.0, "heartbeat_timeout_s": 100.0})
+    control = Control(gains=FixedGains(K1=-2.6, K2=0.5, K3=2.5))
+    changes = {"rates": Rates(control_hz=5.0, telemetry_hz=5.0), "safety": safety, "control": control, "seed": 11}
+    summary = fly_virtual(chain.model_copy(update={**changes, "links": Links(up=calm, down=lossy)})).summary
+    lines = flight_lines(summary)
+    assert (summary.verdict, (summary.headroom_end or 0.0) > 0.4) == ("unstable", True)
+    assert "grow" not in lines["alpha"]
+    assert " by the model of small errors at " in lines["alpha"]
+    assert lines["delay"].endswith("; set-points that were lost do not show in it")

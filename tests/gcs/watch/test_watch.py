@@ -14,10 +14,10 @@ from gcs.link import mavlink
 from gcs.link.datagram import Datagram
 from gcs.plan.design import Design, OwnMargins
 from gcs.watch.links import SYSTEM_ID, Requests, Watch, WatchReport
-from gcs.watch.table import NOT_ASKED, links_table, render
+from gcs.watch.table import NOT_ASKED, RATES_UNKNOWN, links_table, render
 from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links
-from scenarios.schema import Scenario
+from scenarios.schema import Rates, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import SAMPLED, MemoryRecorder
 from tests.support.fleets.flown_copters import three
@@ -38,10 +38,18 @@ def linked(up: Link, down: Link) -> Scenario:
 class Watched:
     """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
 
-    def __init__(self, scenario: Scenario, *, timesync_hz: float, position_hz: float = 0.0, late_ns: int = 0) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        timesync_hz: float,
+        position_hz: float = 0.0,
+        late_ns: int = 0,
+        rates: Rates | None = None,
+    ) -> None:
         self.truth = MemoryRecorder()
         self.fleet = Fleet(scenario, START_NS, recorder=self.truth)
-        self.watch = Watch()
+        self.watch = Watch(rates=rates)
         self.requests = Requests(timesync_hz, position_hz)
         self.now_ns, self._late_ns = START_NS, late_ns
         self.sent: list[bytes] = []
@@ -101,6 +109,27 @@ def test_round_trips_and_loop_delays_match_links_to_the_microsecond(late_ns: int
     own = OwnMargins(system_id=1, delay_margins_s=(0.05, 0.1))
     figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.5, own_margins=(own,)))[0]
     assert figures.status == "past the margin"
+
+
+@pytest.mark.parametrize(
+    ("telemetry_hz", "station", "longest_s"),
+    [(4.0, False, 0.35), (4.0, True, 0.35), (20.0, False, 0.35), (20.0, True, 0.55)],
+)
+def test_repetition_is_no_loop_delay_to_an_onlooker_either(
+    telemetry_hz: float, station: bool, longest_s: float
+) -> None:
+    """Vehicles report at 4 Hz, over 150 ms each way; the tick, at 20 Hz, is at most 50 ms off.
+
+    What a station at 20 Hz would not get although it asks is late.
+    """
+    far = linked(Link(delay_s=0.15), Link(delay_s=0.15))
+    watched = Watched(far, timesync_hz=10.0, rates=Rates(control_hz=20.0, telemetry_hz=telemetry_hz))
+    watched.run(20.0, [(1, heartbeat(), START_NS)] if station else [])
+    assert bool(watched.watch.stations) == station
+    loop_s = np.array(watched.watch.vehicles[1].loop_delay_s)[20:]
+    assert loop_s.min() == pytest.approx(0.3, abs=0.008)
+    assert loop_s.max() == pytest.approx(longest_s, abs=0.008)
+    assert np.median(loop_s) == pytest.approx((0.3 + longest_s) / 2.0, abs=0.008)
 
 
 def test_silence_gives_lower_bounds_that_hold_and_rise_with_jitter() -> None:
@@ -250,3 +279,28 @@ def test_positions_come_if_asked_for_and_else_the_reason_is_told(asked: bool) ->
     else:
         assert [vehicle.status for vehicle in vehicles] == ["no position"] * 3
         assert f"no position from 1 2 3: {NOT_ASKED}" in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("wanted_hz", "stations", "said"),
+    [
+        (50.0, (), "positions at 4 Hz from 1 2 3 until a station asks; loop delays are for 50 Hz"),
+        (50.0, (255,), "positions at 4 Hz from 1 2 3, not 50 Hz: the difference counts as loop delay"),
+        (4.0, (), ""),
+        (None, (), RATES_UNKNOWN),
+    ],
+)
+def test_slow_positions_are_told_with_what_they_do(
+    wanted_hz: float | None, stations: tuple[int, ...], said: str
+) -> None:
+    watched = Watched(CHAIN, timesync_hz=10.0)
+    watched.run(3.0)
+    report = WatchReport(
+        listening="", duration_s=3.0, delay_margin_s=0.3, margin_of="", silent=False, send_errors=0, stations=stations,
+        sent={"TIMESYNC": 1}, refused={}, vehicles=tuple(watched.watch.figures(watched.now_ns, None)),
+        scenario_telemetry_hz=wanted_hz,
+    )  # fmt: skip
+    text = io.StringIO()
+    Console(file=text, width=80).print(render(report, width=80))
+    told = [line for line in text.getvalue().splitlines() if "position" in line]
+    assert told == ([said] if said else [])
