@@ -29,14 +29,16 @@ class Weights(NamedTuple):
     Q: FloatArray
     R: FloatArray
 
-    def check_fits(self, plant: Plant) -> None:
-        """Raise BadModelError unless the weights are as above and of the plant's size."""
-        for name, weight, size in (("Q", self.Q, plant.states), ("R", self.R, plant.B.shape[1])):
+    def fitting(self, plant: Plant) -> "Weights":
+        """The weights as arrays; raises BadModelError unless they are as above and of the plant's size."""
+        arrays = Weights(np.asarray(self.Q, float), np.asarray(self.R, float))
+        for name, weight, size in (("Q", arrays.Q, plant.states), ("R", arrays.R, plant.B.shape[1])):
             least, wanted = (-1e-12, "semidefinite") if name == "Q" else (1e-14, "definite")
             symmetric = weight.shape == (size, size) and np.allclose(weight, weight.T, rtol=1e-12, atol=0.0)
             if not symmetric or np.linalg.eigvalsh(weight)[0] < least * max(np.abs(weight).max(), 1e-300):
                 wanted = f"a symmetric, positive {wanted} matrix of {size} rows is wanted"
                 raise BadModelError(f"{name}, of shape {weight.shape}, does not fit: {wanted}")
+        return arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +156,7 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
     >>> K.round(12).tolist(), round(cost, 12)
     ([[-2.0]], 2.0)
     """
-    weights.check_fits(plant)
+    weights = weights.fitting(plant)
     try:
         P = linalg.solve_continuous_are(plant.A, plant.B, weights.Q, weights.R)
     except np.linalg.LinAlgError as error:

@@ -86,7 +86,7 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
     `gains.formation.fixed_modes` finds an unstable mode.
     """
     check_fits(plant, pattern)
-    weights.check_fits(plant)
+    weights = weights.fitting(plant)
     observable = Weights(weights.Q + 1e-6 * np.eye(plant.states), weights.R)
     gain = np.zeros(pattern.mask.shape)
     cost = Cost(plant, pattern.mask, observable)

@@ -10,7 +10,8 @@ the loop is unstable from that size |Δ| on at which det(I − M(z) Δ) = 0 some
     μ_R(M) = inf over 0 < γ ≤ 1 of σ_2 [[Re M, −γ Im M], [Im M / γ, Re M]],
 
 by the formula of Qiu, Bernhardsson, Rantzer, Davison, Young and Doyle, "A formula for computation of the real stability
-radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). A constant Δ that couples two axes acts as a complex
+radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). Of a single error, M is a number: μ_R is |M| where M is
+real, and 0 elsewhere. A constant Δ that couples two axes acts as a complex
 one of one axis, so the complex radius is also that of constant disturbances of north and east together.
 
 The worst Δ comes with either radius. The complex one has rank one, and first-order all-pass filters (c + 1/z) /
@@ -18,11 +19,11 @@ The worst Δ comes with either radius. The complex one has rank one, and first-o
 """
 
 from dataclasses import dataclass
-from math import inf, pi, tau
+from math import ceil, inf, pi, tau
 
 import numpy as np
 
-from gains.core._bracketing import Functions, highest, peaks
+from gains.core._bracketing import Functions, bracketed_roots, highest, peaks
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.performance.disturbed import DisturbedFormation
@@ -31,6 +32,8 @@ from gains.sampled._loop import HeldPlant
 # angles per period of the first look, the least of them, and the range of log γ
 _ANGLES, _LEAST_ANGLE, _LEAST_LOG_GAMMA = 400, 1e-5, -14.0
 _GAMMAS = 25
+# angles per radian that late commands turn M, and the places beside each resonance in units of its width
+_PER_RADIAN, _BESIDE = 8, np.concatenate([way * 2.0 ** np.arange(-3.0, 10.0) for way in (-1.0, 1.0)])
 # entries of the worst disturbance this small beside its largest are none
 _NOTHING = 1e-9
 _ROTATIONS = 180
@@ -92,6 +95,8 @@ class SectorLoop:
     def real_radius(self) -> Worst:
         """The least size of a constant disturbance, the same on each axis."""
         ends = np.array([0.0, pi / self.formation.period_s])
+        if len(self.errors) == 1:
+            return self._real_radius_of_one(ends)
         at_ends = spectral_norms(self.response(ends).real)
 
         def largest(omega: FloatArray) -> FloatArray:
@@ -110,6 +115,30 @@ class SectorLoop:
             return Worst(1.0 / peak, omega, np.outer(right[0], left[:, 0]))
         direction = _worst_constant(M, float(_real_measure(M[np.newaxis])[1][0]))
         return Worst(1.0 / peak, omega, direction)
+
+    def _real_radius_of_one(self, ends: FloatArray) -> Worst:
+        """That of a single error: M is real at the ends, and where its imaginary part changes sign on a fine grid."""
+
+        def imaginary(omega: FloatArray) -> FloatArray:
+            return self.response(omega)[:, 0, 0].imag
+
+        T = self.formation.period_s
+        z = np.linalg.eigvals(self.formation.period_map())
+        angles, widths = np.abs(np.angle(z)), 1.0 - np.abs(z)
+        beside = (angles[:, np.newaxis] + widths[:, np.newaxis] * _BESIDE).ravel()
+        late = max(float(np.max(self.formation.delay_s)), self.formation.assumed_s or 0.0) / T
+        evenly = np.linspace(0.0, pi, ceil(_PER_RADIAN * pi * (late + 2.0)))
+        grid = np.concatenate([np.geomspace(_LEAST_ANGLE, pi, _ANGLES), evenly, angles, beside])
+        grid = np.unique(grid[(grid > 0.0) & (grid < pi * (1.0 - 1e-9))]) / T
+        values = imaginary(grid)
+        k = np.flatnonzero(values[:-1] * values[1:] < 0.0)
+        passed = bracketed_roots(imaginary, grid[k], grid[k + 1], values[k], values[k + 1])
+        omega = np.concatenate([ends, passed])
+        M = self.response(omega)[:, 0, 0].real
+        best = int(np.argmax(np.abs(M)))
+        if M[best] == 0.0:
+            return Worst(inf, 0.0, np.zeros((0, 0)))
+        return Worst(1.0 / float(np.abs(M[best])), float(omega[best]), np.sign(M[best]).reshape(1, 1))
 
     @property
     def _entry(self) -> FloatArray:

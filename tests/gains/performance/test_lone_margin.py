@@ -6,7 +6,8 @@ import pytest
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 from gains.performance.lone_margin import lone_margin
-from gains.performance.response import Response, continuous_margin, own_dynamics, sampled_margin
+from gains.performance.response import Response, continuous_margin, formation_loop, own_dynamics, sampled_margin
+from gains.sampled._loop import HeldPlant, lifted_map, radius_of
 from gains.sampled.multirate import Timing
 
 PAIR = FormationModel((-1, 0), axes=1)
@@ -54,3 +55,27 @@ def test_a_dead_time_that_alone_breaks_the_loop_leaves_no_margin() -> None:
     assert lone_margin(3.0, 3.0, Response(0.2, 0.5, 0.2), period_s=0.02) == 0.0
     with pytest.raises(BadModelError, match="natural frequency"):
         Response(0.1, 1.0, 0.05, 14.0)
+
+
+@pytest.mark.parametrize(
+    ("k1", "response"),
+    [(1.2, Response(0.1, 0.0, natural_frequency_rad_s=3.0)), (2.0913, Response(0.11629684, 5.26287, 0.17118))],
+)
+def test_a_leader_that_is_unstable_at_once_has_no_margin(k1: float, response: Response) -> None:
+    leader = formation_loop(FormationModel((-1,), axes=1), np.array([[-k1]]), [response])
+    assert radius_of(lifted_map(HeldPlant(*leader, 0.02), 0.0)) > 1.0
+    assert lone_margin(k1, 0.0, response, period_s=0.02) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("k1", "k3", "response"),
+    [(4.4, 0.0, Response(0.012, 1.15)), (2.0, 1.5, Response(0.005, 0.0)), (0.5, 0.0, Response(0.002, 0.0))],
+)
+def test_spectral_radius_is_one_at_the_margin_for_short_lags(k1: float, k3: float, response: Response) -> None:
+    A, B, K = formation_loop(PAIR, PAIR.overlapping_gain([[-k1]], [[0.0]], [[k3]]), [response] * 2)
+    own = np.array([0, 1, 2]) != (1 if k3 == 0.0 else 0)  # without leader, or without spacing
+    own = np.append(own, np.ones(len(A) - 3, dtype=bool))
+    margin_s = lone_margin(k1, k3, response, period_s=0.25)
+    plant = HeldPlant(A[np.ix_(own, own)], B[own], K[:, own], 0.25)
+    before, after = (radius_of(lifted_map(plant, factor * margin_s)) for factor in (1 - 1e-4, 1 + 1e-4))
+    assert before < 1.0 < after

@@ -86,6 +86,18 @@ def test_no_constant_disturbance_below_the_real_radius_is_found() -> None:
     assert max(growths) > -0.1  # the search came near: without disturbance errors decay at 1.6 1/s
 
 
+@pytest.mark.parametrize("case", [(1, 0, 0.0), (1, 0, 1.4), (2, 2, 0.0), (2, 2, 0.3), (2, 1, 0.3)])
+def test_real_radius_of_one_error_is_the_least_unstable_constant(case: tuple[int, int, float]) -> None:
+    vehicles, error, delay_s = case
+    model = FormationModel((-1, 0)[:vehicles], axes=1)
+    K = model.overlapping_gain([[-1.0]], [[0.0]], [[0.5]])
+    loop = SectorLoop(DisturbedFormation(model, model.A, model.B, K, T, delay_s), (error,))
+    worst = loop.real_radius()
+    assert growth_1_s(loop, worst.radius_1_s * worst.direction) == pytest.approx(0.0, abs=1e-9)
+    smaller = np.linspace(-0.999, 0.999, 200) * worst.radius_1_s
+    assert max(growth_1_s(loop, np.array([[size]])) for size in smaller) < 0.0
+
+
 def test_one_follower_has_the_robustness_bound_and_the_whole_less() -> None:
     alpha = robustness(-3.408, 0.6309, 5.6081)
     # sampling at 50 Hz moves it by less than half a period times the frequency, squared
