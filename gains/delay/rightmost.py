@@ -21,6 +21,8 @@ from gains.core.structure import Block, balanced, distinct_blocks, square_matric
 _POINTS = 12
 # larger discretisations take tens of seconds
 _LARGEST_MATRIX = 1500
+# roots of two discretisations are one this close together, relative
+_SAME = 1e-6
 
 
 def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
@@ -72,12 +74,49 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
     upper = approximations[approximations.imag >= 0.0]
     upper = upper[np.argsort(-upper.real)]
     # the rightmost approximation need not belong to the rightmost root: all within its error band are refined
-    band = 0.05 * (abs(upper[0]) + 1.0 / delays.max())
+    band = _band(delays, upper[0])
     near = int(np.count_nonzero(upper.real > upper[0].real - band))
     tried = upper[: min(near, 12) if count == 1 else 2 * count + 12].tolist()
     found = [_newton(matrices, delays, root) for root in tried]
+    rightmost = max(found, key=lambda root: root.real)
+    if not (rightmost.real > upper[0].real - band and _is_root(matrices, delays, rightmost)):
+        return _roots_among_others(matrices, delays, count)
     # approximations farther left may be of no root at all, or several of one
     return found if count == 1 else _apart(matrices, delays, found)
+
+
+def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) -> list[complex]:
+    """The same where the rightmost approximation is of no root, as where what is late is weak: on ever more points.
+
+    A root right of one at r turns no faster than by the sum of |A_k| e^{-r tau_k}, which the points must resolve. Where
+    terms cancel, that is far too fast: two further looks that find no other root are enough.
+    """
+    rightmost: list[complex] = []
+    while True:
+        approximations = _pseudospectral_roots(matrices, delays, count - 1, finer=2.0 ** len(rightmost))
+        upper = approximations[approximations.imag >= 0.0]
+        found: list[complex] = []
+        for start in upper[np.argsort(-upper.real)].tolist():
+            if len(found) >= count and start.real < sorted(root.real for root in found)[-count] - _band(delays, start):
+                break
+            found = _apart(matrices, delays, [*found, _newton(matrices, delays, start)])
+        s = max(found, key=lambda root: root.real, default=complex(np.nan))
+        rightmost.append(s)
+        with np.errstate(over="ignore"):
+            highest = _turning(matrices, np.exp(-s.real * delays))
+        resolved = len(approximations) / matrices.shape[1] - 1.0
+        enough = resolved >= _POINTS + np.hypot(highest, s.real) * float(delays.max()) / 2.0
+        if enough or (len(rightmost) > 2 and max(abs(s - other) for other in rightmost[-3:]) <= _SAME * abs(s)):
+            return found
+
+
+def _band(delays: FloatArray, s: complex) -> float:
+    """How far left of its root an approximation may be."""
+    return 0.05 * (abs(s) + 1.0 / float(delays.max()))
+
+
+def _is_root(matrices: FloatArray, delays: FloatArray, s: complex) -> bool:
+    return bool(_apart(matrices, delays, [s]))
 
 
 def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -> list[complex]:
@@ -92,16 +131,21 @@ def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -
     return kept
 
 
-def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int) -> ComplexArray:
+def _turning(matrices: FloatArray, weights: FloatArray) -> float:
+    """A bound of |Im s| of roots right of a line on which |e^{-s tau_k}| are the `weights`."""
+    turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
+    return turning + float((np.linalg.norm(matrices[1:], 2, axis=(1, 2)) * weights[1:]).sum())
+
+
+def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0) -> ComplexArray:
     """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate.
 
     Each of the `further` chains of roots on the left turns once more over the longest delay.
     """
     n, longest = matrices.shape[1], float(delays.max())
-    # roots near or right of the axis have |Im s| below this bound
-    turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
-    highest = turning + float(np.linalg.norm(matrices[1:], 2, axis=(1, 2)).sum())
-    points = _POINTS + highest * longest / 2.0 + 4.0 * further
+    # of roots near or right of the axis
+    highest = _turning(matrices, np.ones(len(delays)))
+    points = finer * (_POINTS + highest * longest / 2.0 + 4.0 * further)
     if not n * (points + 1.0) <= _LARGEST_MATRIX:
         raise BadModelError(
             f"the longest delay is {longest} s and a block of {n} states may oscillate at {highest:.3g} rad/s, "
