@@ -43,8 +43,8 @@ from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.response import Response, formation_loop
-from gains.sampled._loop import HeldPlant, held_entry, radius_of, rate_of
-from gains.sampled.multirate import Timing
+from gains.sampled._loop import HeldPlant, held_entry, radius_of, rate_of, settled_covariance
+from gains.sampled.multirate import Predictor, Timing, multirate_map
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
 _FREQUENCIES, _LOWEST = 1600, 1e-3
@@ -52,6 +52,8 @@ _FREQUENCIES, _LOWEST = 1600, 1e-3
 _SHORT = 4.0
 # of the integral of the noise over the unit circle, which converges like a power of the number
 _ANGLES = 4096
+# where motions decay less than by e to this power in twice as many periods, the covariance takes its place
+_DECAYED = 25.0
 
 
 def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArray:
@@ -189,6 +191,10 @@ class PredictedFigures:
         """Standard deviation of the noisiest command where every sampled error has white noise of 1."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
+        # the angles leave out about as much as noise has decayed after twice as many periods
+        slow = 2 * _ANGLES * self.period_s * self.decay_rate_at_delay_1_s < _DECAYED
+        if slow and self.assumed_s + min(self.delays_s) > 0.0:
+            return max(self._settled_noise(delay_s) for delay_s in self.delays_s)
         angles = np.linspace(0.0, pi, _ANGLES, endpoint=False) + pi / (2 * _ANGLES)
         return max(self._noise(angles, delay_s) for delay_s in self.delays_s)
 
@@ -244,6 +250,20 @@ class PredictedFigures:
         known = np.broadcast_to(K @ measured, (len(z), len(K), self.model.states))
         commands = np.linalg.solve(np.eye(len(K)) - K @ self._seen(z, delay_s), known)
         return float((np.abs(commands) ** 2).sum(axis=2).mean(axis=0).max() ** 0.5)
+
+    def _settled_noise(self, delay_s: float) -> float:
+        """The same by the stationary covariance of the last commands, with which the map of a period goes on."""
+        n, told = len(self._plant.A), self.model.states
+        plant, timing = replace(self._plant, K=self._fed_forward), Timing(self.period_s, self.period_s)
+        loop, calm = (
+            multirate_map(own, timing, delay_s=delay_s, predictor=Predictor(own, self.assumed_s))
+            for own in (plant, replace(plant, K=0.0 * plant.K))
+        )
+        entry = (loop - calm)[:, :told]
+        covariance = settled_covariance(loop, entry @ entry.T)
+        if covariance is None:
+            return inf
+        return float(np.diag(covariance)[n : n + len(plant.K)].max() ** 0.5)
 
     @cached_property
     def _ahead(self) -> FloatArray:

@@ -50,6 +50,23 @@ def test_noise_passes_a_prediction_as_a_simulated_loop_says() -> None:
     assert figures.noise_gain_max == pytest.approx(power.max() ** 0.5, rel=1e-6)
 
 
+def test_noise_near_the_edge_of_the_window_is_that_of_a_simulated_loop() -> None:
+    """As above, of all states at once: assumed 0.6 s, true 0.76 s. Motions decay in 7800 ticks."""
+    assumed, late = 30, 38
+    Phi, G = np.eye(3) + PERIOD_S * PAIR.A, PERIOD_S * PAIR.B + PERIOD_S**2 / 2.0 * PAIR.A @ PAIR.B
+    gain = PAIR.overlapping_gain([[-3.4]], [[0.631]], [[5.4]])
+    powers = [np.linalg.matrix_power(Phi, age) for age in range(assumed + 1)]
+    ahead = gain @ np.hstack([powers[assumed], *(powers[age] @ G for age in range(assumed))])
+    x, sent, power = np.zeros((3, 3)), np.zeros((late * 2, 3)), np.zeros(2)  # the newest command first
+    for tick in range(80_000):
+        told = x + np.eye(3) if tick == 0 else x
+        command = ahead @ np.vstack([told, sent[: 2 * assumed]])
+        x, sent = Phi @ x + G @ sent[-2:], np.vstack([command, sent[:-2]])
+        power += (command**2).sum(axis=1)
+    figures = PredictedFigures(PAIR, gain, PERIOD_S, 0.6, (0.76,))
+    assert figures.noise_gain_max == pytest.approx(power.max() ** 0.5, rel=1e-6)
+
+
 def test_gains_with_prediction_decay_faster_within_a_mismatch() -> None:
     """2.32 1/s at least, of a search on a grid, where static gains decay at 0.96 1/s; stable from 0.48 to 0.72 s."""
     criteria = Criteria(0.6, "decay_rate_at_delay_1_s", delays_s=(0.48, 0.72), delay_rate=0.0)
