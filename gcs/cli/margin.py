@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -195,6 +195,8 @@ def _margin_line(margin_s: float, error_s: float) -> str:
     if not isfinite(margin_s):
         return "no limit: stable at every delay"
     line = f"margin {as_known(margin_s, error_s)} s"
+    if isnan(error_s):
+        line += ", its error is not known"
     if margin_s > 0.0 and error_s > 0.5e-6 * margin_s:
         line += f", known to {error_s:.0e} s: nearly equal roots cross together"
     return line
