@@ -16,10 +16,13 @@ leaves out the price of commands.
 Derived here. For a follower and no price X is known in closed form, with which the tests find the same numbers.
 """
 
+from math import inf
+
 import numpy as np
 from scipy import linalg
 
 from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
 from gains.core.structure import real_matrix, seconds, square_matrices
 
 # ε of the price of commands as a share of the unit of the states: from here on four digits of α stay the same
@@ -32,7 +35,9 @@ _LEAST_GAMMA, _LARGEST_GAMMA = 0.1, 1e4
 def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = _PRICE) -> float:
     """Return the α (1/s) that no controller of E' = A E + B u(t − delay) + w exceeds; 0 below 1e-4.
 
-    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. BadModelError if they are not.
+    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. `price` > 0 is ε; the
+    usual one makes α too small by up to 1e-3 of itself. BadModelError if they are not. Without delay α is `inf` with as
+    many inputs as states.
 
     A follower at 0.31 s, which is 0.3 s of loop delay and half a period of 20 ms; without delay α stays below 1:
 
@@ -42,9 +47,20 @@ def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = 
     """
     [state], entry = square_matrices(A=A), real_matrix("B", B)
     seconds("delay_s", delay_s)
+    n = len(state)
+    if len(entry) != n:
+        raise BadModelError(f"B has shape {entry.shape}; {n} rows are wanted, as A")
+    if (rank := int(np.linalg.matrix_rank(entry))) < min(entry.shape):
+        raise BadModelError(f"B has the rank {rank}; {min(entry.shape)} is wanted")
+    if not (np.isfinite(price) and price > 0.0):
+        raise BadModelError(f"price is {price}; a positive number is wanted")
+    if delay_s == 0.0 and rank == n:
+        return inf
     low, high = _LEAST_GAMMA, _LARGEST_GAMMA
     if not _is_reached(state, entry, high, delay_s, price):
         return 0.0
+    if _is_reached(state, entry, low, delay_s, price):  # looked at ten times slower, commands cost as little
+        return 10.0 * alpha_bound(state / 10.0, entry, 10.0 * delay_s, price=price)
     for _ in range(_HALVINGS):
         middle = (low * high) ** 0.5
         low, high = (low, middle) if _is_reached(state, entry, middle, delay_s, price) else (middle, high)

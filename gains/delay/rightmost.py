@@ -21,6 +21,8 @@ from gains.core.structure import Block, balanced, distinct_blocks, square_matric
 _POINTS = 12
 # larger discretisations take tens of seconds
 _LARGEST_MATRIX = 1500
+# roots of two discretisations are one this close together, relative
+_SAME = 1e-6
 
 
 def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
@@ -86,25 +88,26 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
 def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) -> list[complex]:
     """The same where the rightmost approximation is of no root, as where what is late is weak: on ever more points.
 
-    A root right of one at r turns no faster than by the sum of |A_k| e^{-r tau_k}, which the points must resolve.
+    A root right of one at r turns no faster than by the sum of |A_k| e^{-r tau_k}, which the points must resolve. Where
+    terms cancel, that is far too fast: two further looks that find no other root are enough.
     """
-    finer = 1.0
+    rightmost: list[complex] = []
     while True:
-        approximations = _pseudospectral_roots(matrices, delays, count - 1, finer)
+        approximations = _pseudospectral_roots(matrices, delays, count - 1, finer=2.0 ** len(rightmost))
         upper = approximations[approximations.imag >= 0.0]
         found: list[complex] = []
         for start in upper[np.argsort(-upper.real)].tolist():
             if len(found) >= count and start.real < sorted(root.real for root in found)[-count] - _band(delays, start):
                 break
             found = _apart(matrices, delays, [*found, _newton(matrices, delays, start)])
-        if found:
-            r = max(root.real for root in found)
-            with np.errstate(over="ignore"):
-                highest = _turning(matrices, np.exp(-r * delays))
-            resolved = len(approximations) / matrices.shape[1] - 1.0
-            if resolved >= _POINTS + np.hypot(highest, r) * float(delays.max()) / 2.0:
-                return found
-        finer *= 2.0
+        s = max(found, key=lambda root: root.real, default=complex(np.nan))
+        rightmost.append(s)
+        with np.errstate(over="ignore"):
+            highest = _turning(matrices, np.exp(-s.real * delays))
+        resolved = len(approximations) / matrices.shape[1] - 1.0
+        enough = resolved >= _POINTS + np.hypot(highest, s.real) * float(delays.max()) / 2.0
+        if enough or (len(rightmost) > 2 and max(abs(s - other) for other in rightmost[-3:]) <= _SAME * abs(s)):
+            return found
 
 
 def _band(delays: FloatArray, s: complex) -> float:

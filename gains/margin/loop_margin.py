@@ -28,6 +28,7 @@ from gains.delay._windows import DelayAnalysis, combined_analysis
 from gains.delay.constant import Crossing
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
+from gains.sampled._loop import HeldPlant, held_blocks, lifted_map, radius_of
 
 # largest multiple of the unknown, in units of the common divisor of all
 _MOST_STEPS = 200
@@ -72,7 +73,7 @@ class LoopMargin:
     """The windows of stability, complete up to `complete_to_s`; the last may end at inf."""
     delay_margin_s: float
     delay_margin_error_s: float
-    """The end of the window that begins at 0, or 0 without one, and its estimated error."""
+    """The end of the window that begins at 0, or 0 without one, and its estimated error; nan if that is not known."""
     crossings: tuple[MarginCrossing, ...]
     unstable_roots_at_zero_delay: int
     """The number of roots right of the axis with the unknown at zero."""
@@ -209,6 +210,13 @@ def _held_moving(model: HeldModel) -> tuple[tuple[FloatArray, FloatArray, FloatA
     return ((plant, *factor_rank(feedback)), fixed) if fixed else ((model.A, model.B, model.K), 0)
 
 
+def _held_parts(loop: tuple[FloatArray, FloatArray, FloatArray], period_s: float) -> list[tuple[HeldPlant, int]]:
+    """The blocks of a held loop with their copies; the whole loop once where no two are equal."""
+    A, B, K = loop
+    plants, copies = held_blocks(A, B, K, period_s=period_s), [block.copies for block in distinct_blocks(A, B @ K)]
+    return list(zip(plants, copies, strict=True)) if max(copies) > 1 else [(HeldPlant(A, B, K, period_s), 1)]
+
+
 def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
     omega = crossing.omega_rad_s
     repeats_every_s = 2.0 * pi / omega * scale if omega > 0.0 else None
@@ -218,12 +226,17 @@ def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
 
 def _with_unknown_period(model: HeldModel) -> LoopMargin:
     from gains.sampled._period import analyse_period
-    from gains.sampled.constant import period_map
 
     loop, fixed = _held_moving(model)
+    # equal followers in one map would have no eigenvalue of their own
+    parts = [part for part, _ in _held_parts(loop, 1.0)]
+
+    def map_at(part: HeldPlant, period_s: float) -> FloatArray:
+        return lifted_map(replace(part, period_s=period_s), 0.0)
 
     def error_s(period_s: float) -> float:
-        return _map_error(lambda at_s: period_map(*loop, period_s=at_s, delay_s=0.0), period_s)
+        crossing = min(parts, key=lambda part: abs(radius_of(map_at(part, period_s)) - 1.0))
+        return _map_error(lambda at_s: map_at(crossing, at_s), period_s)
 
     analysis = analyse_period(*loop)
     crossings = tuple(
@@ -247,17 +260,21 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
 
 def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     """The first window of the held loop as it is flown."""
-    from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
+    from gains.sampled._crossings import block_delay_margin
+    from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
     loop, fixed = _held_moving(model)
+    parts = _held_parts(loop, period_s)
+    # equal followers in one map would have no eigenvalue of their own
+    first = parts[0][0] if len(parts) == 1 else min((part for part, _ in parts), key=block_delay_margin)
 
     def map_at(delay_s: float) -> FloatArray:
-        return period_map(*loop, period_s=period_s, delay_s=delay_s)
+        return lifted_map(first, delay_s)
 
     margin_s = sampled_delay_margin(*loop, period_s=period_s)
     crossings: tuple[MarginCrossing, ...] = ()
     checks: tuple[str, ...] = ()
-    if 0.0 < margin_s < inf and len(loop[0]) + loop[1].shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
+    if 0.0 < margin_s < inf and len(first.A) + first.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
         delays_s = [(1.0 - _BESIDE) * margin_s, margin_s, (1.0 + _BESIDE) * margin_s]
         before, at, after = (spectral_radius(*loop, period_s=period_s, delay_s=delay_s) for delay_s in delays_s)
         # it may touch one at a whole period and be smaller on both sides
@@ -270,15 +287,17 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
         eigenvalues = np.linalg.eigvals(map_at(margin_s))
         omega = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))]))) / period_s
         crossings = (MarginCrossing(omega, margin_s, 1, None, None, _map_error(map_at, margin_s)),)
-    at_once = np.linalg.eigvals(map_at(0.0))
+    at_once = [(np.linalg.eigvals(lifted_map(part, 0.0)), copies) for part, copies in parts]
     beyond = "" if margin_s == inf else "; longer delays than its margin were not looked at"
     return LoopMargin(
         unknown="tau",
         stable_intervals_s=((0.0, margin_s),) if margin_s > 0.0 else (),
         delay_margin_s=margin_s,
-        delay_margin_error_s=max((crossing.delay_error_s for crossing in crossings), default=0.0),
+        delay_margin_error_s=crossings[0].delay_error_s if crossings else nan if 0.0 < margin_s < inf else 0.0,
         crossings=crossings,
-        unstable_roots_at_zero_delay=int(np.count_nonzero(np.abs(at_once) > 1.0 + _ROUNDING)),
+        unstable_roots_at_zero_delay=sum(
+            copies * int(np.count_nonzero(np.abs(z) > 1.0 + _ROUNDING)) for z, copies in at_once
+        ),
         roots_fixed_at_zero=fixed,
         complete_to_s=margin_s,
         checked_by=checks,

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -182,6 +182,7 @@ def _verdict_lines(margin: LoopMargin) -> list[str]:
     if isfinite(margin_s):
         rough = margin_s > 0.0 and error_s > 0.5e-6 * margin_s
         why = f", known to {error_s:.0e} s: nearly equal roots cross together" if rough else ""
+        why = ", its error is not known" if isnan(error_s) else why
         lines.append(f"margin {as_known(margin_s, error_s)} s{why}")
     else:
         lines.append("no limit: stable at every delay")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gains.core.errors import BadModelError
 from gains.criteria.bound import alpha_bound
 
 FOLLOWER = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
@@ -48,3 +49,20 @@ def test_bound_falls_with_delay_from_one() -> None:
     assert bounds[0] == pytest.approx(1.0, abs=1e-6)  # |c| / √(1 + c²) of the source for c without bound
     assert bounds[2] == pytest.approx(0.9538, abs=1e-4)
     assert bounds == sorted(bounds, reverse=True)
+
+
+@pytest.mark.parametrize(("a", "late_s"), [(0.0, 0.05), (0.0, 1e-3), (-50.0, 0.3), (-3.0, 0.3)])
+def test_bound_of_one_state_is_the_closed_form(a: float, late_s: float) -> None:
+    # without a price the block is cos ωh − (a/ω) sin ωh, with ω² = α² − a²
+    omega = np.linspace(1e-3, np.pi, 100_001) / late_s
+    block = np.cos(omega * late_s) - a / omega * np.sin(omega * late_s)
+    first = omega[np.flatnonzero(block <= 0.0)[0]]
+    found = alpha_bound(np.array([[a]]), np.eye(1), late_s)
+    assert found == pytest.approx(np.hypot(first, a), rel=1e-3)
+    assert alpha_bound(np.array([[a]]), np.eye(1), 0.0) == np.inf
+
+
+def test_wrong_entries_and_prices_are_refused() -> None:
+    for B, price, wanted in [(np.zeros((2, 1)), 1e-4, "rank"), (np.eye(3), 1e-4, "rows"), (np.eye(2), 0.0, "price")]:
+        with pytest.raises(BadModelError, match=wanted):
+            alpha_bound(FOLLOWER[0], B, 0.3, price=price)

@@ -1,4 +1,4 @@
-"""Consensus that is sampled and held: its common value is left out, the disagreement is judged."""
+"""Held loops of many alike: of consensus the disagreement is judged, of equal followers one."""
 
 import json
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gains.core.arrays import FloatArray, RealArray
+from gains.formation.model import FormationModel
 from gains.margin.loop_margin import LoopMargin, loop_margin
 from gains.margin.model_file import parse_model
 from gains.sampled.constant import period_map
@@ -61,3 +62,22 @@ def test_formation_of_double_integrators_loses_place_and_velocity() -> None:
 def test_integrator_that_nobody_feeds_back_has_no_margin() -> None:
     found = margin_of(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)), PERIOD_S)
     assert (found.delay_margin_s, found.roots_fixed_at_zero) == (0.0, 0)
+
+
+@pytest.mark.parametrize("period_s", [PERIOD_S, None])
+def test_equal_followers_have_the_error_and_frequency_of_one(period_s: float | None) -> None:
+    def found(followers: int) -> LoopMargin:
+        chain = FormationModel((-1, *range(followers)), axes=1)
+        return margin_of(chain.A, chain.B, chain.overlapping_gain([[-1.0]], [[0.3]], [[0.25]]), period_s)
+
+    one, many = found(1), found(20)
+    assert many.delay_margin_s == pytest.approx(one.delay_margin_s, rel=1e-12)
+    assert many.delay_margin_error_s < 1e-6 * many.delay_margin_s
+    assert many.crossings[0].omega_rad_s == pytest.approx(one.crossings[0].omega_rad_s, rel=1e-6)
+    assert many.checked_by == one.checked_by
+
+
+def test_error_of_a_margin_of_too_large_a_map_is_not_known() -> None:
+    found = margin_of(np.zeros((1, 1)), np.eye(1), -np.eye(1), 0.004)  # pi / 2 s are 393 periods
+    assert np.isnan(found.delay_margin_error_s)
+    assert found.crossings == found.checked_by == ()
