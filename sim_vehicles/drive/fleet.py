@@ -37,8 +37,6 @@ from sim_vehicles.vehicles.onboard import VehicleLoop
 from sim_vehicles.vehicles.plain import leave_all, next_leaving_ns, run_at, step_all
 from sim_vehicles.vehicles.shell import Change, Radio, Shell
 
-_SECTOR = 0
-"""In place of a system id: the disturbance that depends on the errors of all vehicles."""
 _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 
@@ -49,8 +47,6 @@ class _Member:
     up: Link
     down: Link
     signed: SignedLink | None = None
-    acts_ns: int = NEVER_NS
-    """When the vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
 
 
 class FleetArrays(NamedTuple):
@@ -103,11 +99,11 @@ class Fleet:
         self._vehicles = new_vehicles(count)
         self._columns = Columns(self._vehicles)
         self._waiting = np.zeros((count, 2), np.int64)
+        self._acts_ns = np.zeros(count, np.int64)
+        """When each vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
         most = max(64, 2 * count)  # datagrams that leave at one time; of more, the kernel returns a part
         self._leaving, self._leaving_data = np.zeros((4, most), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
         self._edge = self._waiting, self._leaving, self._leaving_data
-        self._acts: list[tuple[int, int]] = []
-        """(acts_ns, system id), if events run in order of time; stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
         """The station's datagrams if events run in order of time: (time, system id, number, data), earliest first."""
         self._entered = 0
@@ -115,6 +111,8 @@ class Fleet:
         experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
         disturbance = scenario.disturbance
         self._sector = None if disturbance is None or disturbance.sector is None else SectorBound(scenario)
+        self._disturbs_ns = NEVER_NS if self._sector is None else start_ns
+        """When the disturbance that depends on the errors of all vehicles next acts."""
         self._in_order = sensors or self._links.have_channels or self._sector is not None
         for row, own in enumerate(sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id)):
             radio = Radio(scenario, own, start_ns, recorder, Place(self._vehicles, self._columns, row))
@@ -134,8 +132,6 @@ class Fleet:
         self._rows = {system_id: row for row, system_id in enumerate(self._members)}
         for member in self._in_rows:
             self._plan(member)
-        if self._sector is not None:
-            heapq.heappush(self._acts, (start_ns, _SECTOR))
 
     @property
     def next_event_ns(self) -> int:
@@ -303,25 +299,23 @@ class Fleet:
         for system_id, data, time_ns in received:
             self._entered += 1
             heapq.heappush(self._entering, (time_ns, system_id, self._entered, data))
-        acts, entering = self._acts, self._entering
+        entering = self._entering
         while True:
-            acts_ns, acting_id = acts[0] if acts else (NEVER_NS, 0)
+            row = self._acts_ns.argmin()
+            first_ns = min(self._disturbs_ns, self._acts_ns.item(row))
             enters_ns = entering[0][0] if entering else NEVER_NS
-            if enters_ns <= acts_ns and enters_ns <= now_ns:
+            if enters_ns <= first_ns and enters_ns <= now_ns:
                 time_ns, system_id, _, data = heapq.heappop(entering)
                 member = self._members[system_id]
                 member.down.send(data, time_ns)
-            elif acts_ns <= now_ns:
-                heapq.heappop(acts)
-                if acting_id == _SECTOR:
-                    self._disturb(acts_ns)
-                    continue
-                member = self._members[acting_id]
-                if acts_ns != member.acts_ns:
-                    continue
-                self._catch_up(member, acts_ns)
-            else:
+            elif first_ns > now_ns:
                 return
+            elif first_ns == self._disturbs_ns:
+                self._disturb(first_ns)
+                continue
+            else:
+                member = self._in_rows[row]
+                self._catch_up(member, first_ns)
             self._plan(member)
 
     def _disturb(self, now_ns: int) -> None:
@@ -332,7 +326,7 @@ class Fleet:
             craft = crafts[system_id]
             assert isinstance(craft, DoubleIntegrator)  # checked when the scenario was read
             craft.push(push, now_ns)
-        heapq.heappush(self._acts, (now_ns + self._sector.period_ns, _SECTOR))
+        self._disturbs_ns = now_ns + self._sector.period_ns
 
     def _catch_up(self, member: _Member, now_ns: int) -> None:
         """Bring a vehicle up to date; what it sends enters its up link."""
@@ -350,11 +344,9 @@ class Fleet:
 
     def _plan(self, member: _Member) -> None:
         """Note when the vehicle next acts."""
-        acts_ns = member.vehicle.next_event_ns
-        self._columns["acts_ns"][member.row] = acts_ns
-        if self._in_order and member.acts_ns != min(acts_ns, member.down.next_due_ns):
-            member.acts_ns = min(acts_ns, member.down.next_due_ns)
-            heapq.heappush(self._acts, (member.acts_ns, member.vehicle.system_id))
+        self._columns["acts_ns"][member.row] = acts_ns = member.vehicle.next_event_ns
+        if self._in_order:
+            self._acts_ns[member.row] = min(acts_ns, member.down.next_due_ns)
 
 
 def prepare(scenario: schema.Scenario) -> None:
