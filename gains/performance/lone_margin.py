@@ -44,10 +44,8 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
     # without a velocity gain a dead time is but more delay, and needs no rational function
     late_s = response.dead_time_s if response.velocity_gain_1_s == 0.0 else 0.0
     own = replace(response, dead_time_s=response.dead_time_s - late_s)
-    A, B, K = formation_loop(FormationModel((-1,), axes=1), np.array([[-k1]]), (own,))
-    if k3 > 0.0:  # with x' = v as its last state
-        A, B, K = np.pad(A, (0, 1)), np.pad(B, ((0, 1), (0, 0))), np.append(K, [[-k3]], axis=1)
-        A[-1, 0] = 1.0
+    loop = formation_loop(FormationModel((-1,), axes=1), np.array([[-k1]]), (own,))
+    A, B, K = _and_position(*loop, k3) if k3 > 0.0 else loop
     if growth_rate(A, B, K, period_s=period_s, delay_s=late_s) >= 0.0:
         return 0.0
 
@@ -74,6 +72,13 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
     beyond = np.abs(loop(omega, 0.0)) >= 1.0
     crossed = np.flatnonzero(beyond[1:] != beyond[:-1])
     return min((_at_crossing(loop, float(omega[k]), float(omega[k + 1])) for k in crossed), default=inf)
+
+
+def _and_position(A: FloatArray, B: FloatArray, K: FloatArray, k3: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The loop with x' = v as its last state, which is fed back by k3."""
+    with_x = np.pad(A, (0, 1))
+    with_x[-1, 0] = 1.0
+    return with_x, np.pad(B, ((0, 1), (0, 0))), np.append(K, [[-k3]], axis=1)
 
 
 def _at_crossing(loop: Callable[[FloatArray, float], ComplexArray], low: float, high: float) -> float:

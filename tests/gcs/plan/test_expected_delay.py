@@ -155,8 +155,8 @@ def test_a_gate_fails_where_lost_set_points_break_the_flight(prediction: Predict
 
 def test_corrupt_datagrams_are_lost_ones() -> None:
     lost, corrupt = (
-        effective_loop_delays_s(flight_plan(losing(Link(delay_s=0.02, **{key: 0.5})))[1])
-        for key in ("loss_probability", "corrupt_probability")
+        effective_loop_delays_s(flight_plan(losing(down))[1])
+        for down in (Link(delay_s=0.02, loss_probability=0.5), Link(delay_s=0.02, corrupt_probability=0.5))
     )
     assert corrupt == lost
 
