@@ -44,8 +44,8 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
     # without a velocity gain a dead time is but more delay, and needs no rational function
     late_s = response.dead_time_s if response.velocity_gain_1_s == 0.0 else 0.0
     own = replace(response, dead_time_s=response.dead_time_s - late_s)
-    loop = formation_loop(FormationModel((-1,), axes=1), np.array([[-k1]]), (own,))
-    A, B, K = _and_position(*loop, k3) if k3 > 0.0 else loop
+    flown = formation_loop(FormationModel((-1,), axes=1), np.array([[-k1]]), (own,))
+    A, B, K = _with_position(*flown, k3) if k3 > 0.0 else flown
     if growth_rate(A, B, K, period_s=period_s, delay_s=late_s) >= 0.0:
         return 0.0
 
@@ -74,7 +74,7 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
     return min((_at_crossing(loop, float(omega[k]), float(omega[k + 1])) for k in crossed), default=inf)
 
 
-def _and_position(A: FloatArray, B: FloatArray, K: FloatArray, k3: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _with_position(A: FloatArray, B: FloatArray, K: FloatArray, k3: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The loop with x' = v as its last state, which is fed back by k3."""
     with_x = np.pad(A, (0, 1))
     with_x[-1, 0] = 1.0
