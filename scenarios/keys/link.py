@@ -137,7 +137,7 @@ class Link(Part):
     loss_probability: Probability = 0.0
     """Probability that a datagram is lost, independently of the others."""
     loss_bursts: LossBursts | None = None
-    """Loss in bursts, in addition to `loss_probability`."""
+    """Loss in bursts, in place of `loss_probability`."""
     duplicate_probability: Probability = 0.0
     """Probability that a datagram which arrives does so twice. The second copy has its own jitter."""
     corrupt_probability: Probability = 0.0
