@@ -35,9 +35,9 @@ _LEAST_GAMMA, _LARGEST_GAMMA = 0.1, 1e4
 def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = _PRICE) -> float:
     """Return the α (1/s) that no controller of E' = A E + B u(t − delay) + w exceeds; 0 below 1e-4.
 
-    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. `price` > 0 is ε; the
-    usual one makes α too small by up to 1e-3 of itself. BadModelError if they are not. Without delay α is `inf` with as
-    many inputs as states.
+    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. `price` > 0 is ε; that given
+    makes α too small by up to 1e-3 of itself. BadModelError if an argument is not as described. Without delay, and
+    with as many inputs as states, α is `inf`.
 
     A follower at 0.31 s, which is 0.3 s of loop delay and half a period of 20 ms; without delay α stays below 1:
 

@@ -19,7 +19,7 @@ from scipy import linalg
 
 from gains.core.arrays import BoolArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, InfeasibleError
-from gains.core.structure import strongly_connected_blocks
+from gains.core.structure import real_matrix, strongly_connected_blocks
 from gains.formation.pattern import Plant
 
 
@@ -31,7 +31,7 @@ class Weights(NamedTuple):
 
     def fitting(self, plant: Plant) -> "Weights":
         """The weights as arrays; raises BadModelError unless they are as above and of the plant's size."""
-        arrays = Weights(np.asarray(self.Q, float), np.asarray(self.R, float))
+        arrays = Weights(real_matrix("Q", self.Q), real_matrix("R", self.R))
         for name, weight, size in (("Q", arrays.Q, plant.states), ("R", arrays.R, plant.B.shape[1])):
             least, wanted = (-1e-12, "semidefinite") if name == "Q" else (1e-14, "definite")
             symmetric = weight.shape == (size, size) and np.allclose(weight, weight.T, rtol=1e-12, atol=0.0)

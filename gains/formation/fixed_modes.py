@@ -66,7 +66,7 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     found: dict[complex, set[int]] = {}
     for states in strongly_connected_blocks(plant.A, linked):
         own = np.ix_(states, states)
-        for mode in _candidates(plant.A[own]):
+        for mode in distinct_modes(plant.A[own]):
             if all(_is_eigenvalue(plant.A[own] + feedback[own], mode) for feedback in feedbacks):
                 found.setdefault(mode, set()).update(states.tolist())
     return tuple(
@@ -92,8 +92,12 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
     return modes
 
 
-def _candidates(A: FloatArray) -> list[complex]:
-    """The distinct eigenvalues of A, one of each complex pair."""
+def distinct_modes(A: FloatArray) -> list[complex]:
+    """The distinct eigenvalues (1/s) of A (n, n), one of each complex pair; those closer than rounding once.
+
+    >>> distinct_modes(np.diag([-1.0, -1.0, -2.0]))
+    [(-1+0j), (-2+0j)]
+    """
     candidates: list[complex] = []
     tolerance = _SAME_EIGENVALUE * max(float(np.linalg.norm(A, 2)), 1e-300)
     for block in distinct_blocks(A):

@@ -31,8 +31,8 @@ _MOST_BEYOND, _LEFT_OUT = 0.05, 1e-4
 def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) -> float:
     """Return the least loop delay (s) at which u = -k1 v - k3 x loses stability; 0 if at once, `inf` if at none.
 
-    `k1` > 0 in 1/s, `k3` >= 0 in 1/s² (0 for a leader). Accurate to 1e-5 relative, but to
-    milliseconds with dead time, velocity gain and short lag together (by the rational function of `own_dynamics`).
+    `k1` > 0 in 1/s, `k3` >= 0 in 1/s² (0 for a leader). Accurate to 1e-5 relative. With dead time, velocity gain and a
+    short lag together it is off by milliseconds, by the rational function of `own_dynamics`.
 
     The leader of `gains.performance.response.sampled_margin`:
 

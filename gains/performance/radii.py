@@ -11,8 +11,8 @@ the loop is unstable from that size |Δ| on at which det(I − M(z) Δ) = 0 some
 
 by the formula of Qiu, Bernhardsson, Rantzer, Davison, Young and Doyle, "A formula for computation of the real stability
 radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). Of a single error, M is a number: μ_R is |M| where M is
-real, and 0 elsewhere. A constant Δ that couples two axes acts as a complex
-one of one axis, so the complex radius is also that of constant disturbances of north and east together.
+real, and 0 elsewhere. A constant Δ that couples two axes acts as a complex one of one axis, so the complex radius is
+also that of constant disturbances of north and east together.
 
 The worst Δ comes with either radius. The complex one has rank one, and first-order all-pass filters (c + 1/z) /
 (1 + c/z) give each of its entries the phase that it has at the worst frequency, so its size is the same at all others.

@@ -212,16 +212,16 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     if not found.response_known:
         yield "         if the vehicles responded at once: how autopilots respond is known once they are identified"
     if (found.effective_loop_delay_s or inf) > _LONGER * found.expected_loop_delay_s:
-        is_past = found.effective_loop_delay_s is None or (found.effective_headroom or 1.0) <= 0.0
-        past = ": unstable" if is_past else ""
+        left = -inf if found.effective_loop_delay_s is None else found.effective_headroom
+        past = ": unstable" if left is not None and left <= 0.0 else ""
         effective = f"{ms_text(found.effective_loop_delay_s)}, headroom {number_text(found.effective_headroom, '.0%')}"
-        yield f"         late and lost datagrams, after which older commands act on, make it {effective}{past}"
+        yield f"         with late and lost datagrams it amounts to a constant {effective}{past}"
     late = f"loop at most {ms_text(found.loop_delay_s_p99)}, headroom at least {number_text(found.headroom_p99, '.0%')}"
     yield f"         for 99 % of the set-points: {late}"
     if found.channels_not_included:
         yield "         without the time that datagrams wait for their channel, which only a flight shows"
     if found.outage_s is not None:
-        yield f"         without outages of links, of up to {found.outage_s:g} s"
+        yield f"         without the outages of links, of up to {found.outage_s:g} s"
     if found.setpoint_gaps > _RARE:
         often = f"{found.setpoint_gaps:.2g} times in the flight, no set-point arrives for safety.setpoint_timeout_s"
         yield f"failsafe about {often}, after which a vehicle holds"

@@ -124,7 +124,7 @@ class ScenarioCheck(Published):
 
     @property
     def least_headroom(self) -> float | None:
-        """The least of `headroom_p99` and `effective_headroom`; None without any margin, or if it has no end."""
+        """The least of `headroom_p99` and `effective_headroom`; None if either is, as where next to nothing arrives."""
         found = self.headroom_p99, self.effective_headroom
         return None if None in found else min(own for own in found if own is not None)
 

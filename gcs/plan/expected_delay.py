@@ -83,10 +83,9 @@ def expected_loop_delays_s(
 
     On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
     first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams, averaged
-    over the phases. Where `heard` names others for a vehicle,
-    it counts from the oldest of their states in place of its own. The time that datagrams wait for a channel is not
-    included (`waits_for_channels`).
+    happen to be. With jitter or losses it is the median over drawn datagrams, averaged over the phases. Where `heard`
+    names others for a vehicle, it counts from the oldest of their states in place of its own. The time that datagrams
+    wait for a channel is not included (`waits_for_channels`).
     """
     ways = _ways(scenario, heard)
     unlike = dict.fromkeys(ways.values())
@@ -105,7 +104,7 @@ def expected_loop_delays_s(
 
 
 def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
-    """Delays drawn over the links of each of a plan's vehicles, whose medians `planned_loop_delays_s` are."""
+    """Delays drawn over the links of each of a plan's vehicles, of which `planned_loop_delays_s` has the medians."""
     ways = _ways(plan.scenario, _heard(plan))
     drawn = _drawn(plan.scenario, dict.fromkeys(ways.values()))
     return {own: drawn[way] for own, way in ways.items()}
@@ -160,7 +159,7 @@ def _effective_s(
         heard = _heard_over(scenario, up, rng)
         if not len(heard.arrived_s):
             return inf
-        # those of other vehicles at all phases to this one's
+        # the vehicles' phases to each other change as well
         own_ticks = heard.arrived_s[0] + np.arange(len(late_s)) * (period_s + k * held_s / len(late_s))
         own_ticks[own_ticks > heard.newest_s[-1]] = np.nan
         sampled_s = heard.newest_s[np.searchsorted(heard.arrived_s, own_ticks, side="right") - 1]

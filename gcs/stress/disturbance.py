@@ -203,7 +203,7 @@ def _onset(
         if zero is not None:  # to where growth seems to pass zero, three widths at most
             middle += float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
         else:  # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
-            middle += -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
+            middle += -2.0 * width if min((point.growth_1_s for point in points), default=0.0) > 0.0 else 2.0 * width
     inside = zero if zero is not None and zero.inside else None
     onset = None if inside is None else inside.varied
     return DisturbanceOnset(

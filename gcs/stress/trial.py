@@ -62,9 +62,9 @@ class Outcome:
     """The outcome of a trial: one row of the campaign's table. None where a value is unknown or does not apply.
 
     `verdict` is that of the whole flight for an own trial. For a probe it is the sign of the growth rate; without one,
-    "aborted" if the flight was, else "unknown", also where its errors broke a limit. `probed` is the
-    first vehicle of the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as
-    long for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see
+    "aborted" if the flight was, else "unknown", also where its errors broke a limit. `probed` is the first vehicle of
+    the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as long for the
+    control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see
     `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.
     `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
     models' growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a

@@ -27,19 +27,32 @@ def test_centralised_lqr_is_stationary_at_the_lyapunov_equations_cost() -> None:
     assert all(cost(K + 1e-2 * rng.normal(size=K.shape)) > least for _ in range(20))
 
 
+_FITTING = "of shape .*: a symmetric, positive .*definite matrix of 3 rows is wanted"
+
+
 @pytest.mark.parametrize("name", ["Q", "R"])
 @pytest.mark.parametrize(
-    "wrong", [np.eye(2), np.triu(np.ones((3, 3))), -np.eye(3), np.full((3, 3), np.nan), np.diag([1.0, 1.0, -1e-9])]
+    ("wrong", "wanted"),
+    [
+        (np.eye(2), _FITTING),
+        (np.triu(np.ones((3, 3))), _FITTING),
+        (-np.eye(3), _FITTING),
+        (np.diag([1.0, 1.0, -1e-9]), _FITTING),
+        (np.full((3, 3), np.nan), "has entries that are not finite"),
+    ],
 )
-def test_weights_that_are_not_wanted_are_refused(name: str, wrong: np.ndarray) -> None:
+def test_weights_that_are_not_wanted_are_refused(name: str, wrong: np.ndarray, wanted: str) -> None:
     plant = Plant(-np.eye(3), np.eye(3))
     weights = Weights(np.eye(3), np.eye(3))._replace(**{name: wrong})
-    with pytest.raises(
-        BadModelError, match=f"{name}, of shape .*: a symmetric, positive .*definite matrix of 3 rows is wanted"
-    ):
+    with pytest.raises(BadModelError, match=f"{name},? {wanted}"):
         centralised_lqr(plant, weights)
 
 
 def test_ratios_are_against_inclusion_of_five_vehicles() -> None:
     costs = [DesignCost("centralised LQR", 200, 3.0, 1), DesignCost("inclusion", 5, 0.2, 3)]
     assert ratios(costs) == pytest.approx([15.0, 1.0])
+
+
+def test_weights_may_be_nested_lists() -> None:
+    plant = Plant([[0.0]], [[1.0]])
+    assert centralised_lqr(plant, Weights([[4.0]], [[1.0]]))[0] == pytest.approx(np.array([[-2.0]]))  # pyright: ignore[reportArgumentType]

@@ -16,15 +16,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from gains.core.arrays import BoolArray, ComplexArray, FloatArray, IntArray
-from gains.core.structure import distinct_blocks, strongly_connected_blocks
+from gains.core.structure import strongly_connected_blocks
+from gains.formation.fixed_modes import distinct_modes
 from gains.formation.pattern import Pattern, Plant
 
 # with up to this many inputs in one component all subsets are tried (256 ranks), with more Wolfe's algorithm
 _LARGEST_EXHAUSTIVE = 8
 # singular values below this share of the largest are zero: rounding is 1e-15, and what a gain moves is far larger
 _RANK_TOLERANCE = 1e-10
-# eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
-_SAME_EIGENVALUE = 1e-5
 # rounds of Wolfe's algorithm
 _ROUNDS = 1000
 
@@ -50,7 +49,7 @@ def fixed_by_rank(plant: Plant, pattern: Pattern) -> dict[complex, tuple[int, ..
     """The fixed modes of a pattern, and the states of the components in which each is fixed."""
     found: dict[complex, set[int]] = {}
     for component in _components(plant, pattern):
-        for mode in _candidates(component.A):
+        for mode in distinct_modes(component.A):
             if _least_rank(component, mode) < component.states.size:
                 found.setdefault(mode, set()).update(component.states.tolist())
     return {mode: tuple(sorted(states)) for mode, states in found.items()}
@@ -66,22 +65,6 @@ def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
         rows = tuple(np.repeat(pattern.blocks[i], pattern.output_sizes) & C.any(axis=1) for i in inputs)
         found.append(_Component(states, plant.A[np.ix_(states, states)], tuple(B[i] for i in inputs), C, rows))
     return found
-
-
-def _candidates(A: FloatArray) -> list[complex]:
-    """The distinct eigenvalues of A, one of each complex pair."""
-    candidates: list[complex] = []
-    tolerance = _SAME_EIGENVALUE * max(float(np.linalg.norm(A, 2)), 1e-300)
-    for block in distinct_blocks(A):
-        left = np.linalg.eigvals(block.matrices[0]).astype(complex).tolist()
-        while left:
-            close = [mode for mode in left if abs(mode - left[0]) <= tolerance]
-            left = [mode for mode in left if abs(mode - left[0]) > tolerance]
-            mean = complex(np.mean(close))
-            mode = complex(mean.real + 0.0, 0.0 if abs(mean.imag) <= tolerance else mean.imag)
-            if mode.imag >= 0.0 and all(abs(mode - other) > tolerance for other in candidates):
-                candidates.append(mode)
-    return candidates
 
 
 def _least_rank(component: _Component, mode: complex) -> int:
