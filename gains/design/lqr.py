@@ -22,6 +22,9 @@ from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix, strongly_connected_blocks
 from gains.formation.pattern import Plant
 
+# of an eigenvalue, relative to the norm
+_ROUNDING = 1e-15
+
 
 class Weights(NamedTuple):
     """Weights of the cost, symmetric: Q (n, n) on states, positive semidefinite, and R (inputs, inputs), definite."""
@@ -159,9 +162,14 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
     weights = weights.fitting(plant)
     try:
         P = linalg.solve_continuous_are(plant.A, plant.B, weights.Q, weights.R)
+        K = -np.linalg.solve(weights.R, plant.B.T @ P)
+        closed = plant.A + plant.B @ K
+        # a mode on the axis that Q does not weigh stays there, to rounding
+        if (slowest := float(np.linalg.eigvals(closed).real.max())) >= -_ROUNDING * np.linalg.norm(closed):
+            raise np.linalg.LinAlgError(f"a root has the real part {slowest:.3g}")
     except np.linalg.LinAlgError as error:
         raise InfeasibleError(
             f"the Riccati equation has no stabilising solution ({error}): (A, B) must be stabilisable and Q must weigh "
             "every mode on the imaginary axis"
         ) from error
-    return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.trace(P))
+    return K, float(np.trace(P))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from gains.core.errors import BadModelError
+from gains.core.errors import BadModelError, InfeasibleError
 from gains.design.lqr import Weights, centralised_lqr
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Plant, formation_plant
@@ -46,6 +46,13 @@ def test_weights_that_are_not_wanted_are_refused(name: str, wrong: np.ndarray, w
     weights = Weights(np.eye(3), np.eye(3))._replace(**{name: wrong})
     with pytest.raises(BadModelError, match=f"{name},? {wanted}"):
         centralised_lqr(plant, weights)
+
+
+@pytest.mark.parametrize("A", [np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([0.0, -1.0]), np.zeros((2, 2))])
+def test_modes_on_the_axis_without_weight_are_refused(A: np.ndarray) -> None:
+    plant = Plant(A, np.array([[1.0], [1.0]]))
+    with pytest.raises(InfeasibleError, match="imaginary axis"):
+        centralised_lqr(plant, Weights(np.zeros((2, 2)), np.eye(1)))
 
 
 def test_ratios_are_against_inclusion_of_five_vehicles() -> None:
