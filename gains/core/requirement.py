@@ -6,7 +6,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -77,6 +77,8 @@ class Criteria:
 
     def __post_init__(self) -> None:
         _check_positive(self, _POSITIVE)
+        if self.maximise not in (None, *(known := get_args(Objective))):
+            raise BadModelError(f"maximise = {self.maximise!r}; wanted one of {', '.join(known)}")
         if self.damping_min is not None and self.damping_min > 1.0:
             raise BadModelError(f"damping_min = {self.damping_min}; wanted at most 1")
         for name in (*AT_DELAY, "discrete"):
@@ -153,6 +155,8 @@ class Requirement:
             raise BadModelError(f"alpha = {self.alpha}; wanted at least {ALPHA_MIN}")
         if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
             raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
+        if self.loop not in ("ground", "onboard"):
+            raise BadModelError(f"loop = {self.loop!r}; wanted ground or onboard")
         if not 0.0 <= self.feed_forward <= 1.0:
             raise BadModelError(f"feed_forward = {self.feed_forward}; wanted a number from 0 to 1")
         if self.feed_forward and (self.loop == "onboard" or self.criteria is not None):

@@ -9,13 +9,13 @@ Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, overload
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
-from gains.core.errors import DisagreementError, InfeasibleError
+from gains.core.errors import BadModelError, DisagreementError, InfeasibleError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
 from gains.core.structure import positive_seconds
 from gains.criteria.predicted import fed_forward
@@ -123,8 +123,8 @@ def design(
     takes a `pattern` that says who may use whose output, the leader-follower pattern (4.6) if not given, and `onboard`,
     the timing of the onboard loop, if that is flown.
 
-    Raises BadModelError if the period is not positive, InfeasibleError if no gains meet the requirement, with what can
-    be reached, and DisagreementError if the exact analysis contradicts the search.
+    Raises BadModelError if the period is not positive or the method unknown, InfeasibleError if no gains meet the
+    requirement, with what can be reached, and DisagreementError if the exact analysis contradicts the search.
 
     A leader and two followers in a chain, with a delay margin of 0.3 s at 50 Hz:
 
@@ -132,11 +132,13 @@ def design(
     >>> round(found.delay_margin_s, 4), found.K1.shape
     (0.3, (2, 2))
     """
+    if method not in (known := ("inclusion", *get_args(GraphMethod))):
+        raise BadModelError(f"method = {method!r}; wanted {', '.join(known[:-1])} or {known[-1]}")
+    positive_seconds("period_s", period_s)
     if method != "inclusion":
         links = leader_follower(formation) if pattern is None else pattern
         return graph_design(formation, links, requirement, method=method, period_s=period_s, onboard=onboard)
     wanted = Requirement() if requirement is None else requirement
-    positive_seconds("period_s", period_s)
     gains = required_gains(wanted, period_s) if wanted.criteria is None else criteria_gains(wanted, period_s)
     identity = np.eye(formation.axes)
     matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
@@ -179,7 +181,7 @@ def evaluate_gains(
     and K3, each of shape (axes, axes), or with a `pattern`, which says who may use whose output, K of u = K e, shape
     (inputs, states). Commands are sampled and held every `period_s`. With K1, K2 and K3 each follower may add the share
     `feed_forward` of the command of the vehicle in front. Raises BadModelError if a gain is not finite, not of its
-    shape or not in the pattern, or the period is not positive.
+    shape or not in the pattern, the share not from 0 to 1, or the period not positive.
 
     K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
 
@@ -187,6 +189,7 @@ def evaluate_gains(
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
     """
+    Requirement(feed_forward=feed_forward)  # refuses what is no share
     if pattern is not None:
         return assess(formation, pattern, checked_pattern_gain(pattern, gains), period_s=period_s)
     own, front, spacing = (

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gains.core.errors import BadModelError, InfeasibleError
+from gains.core.requirement import Criteria
 from gains.criteria.predicted import PredictedFigures, fed_forward
 from gains.delay.constant import delay_margin
 from gains.design.design import Design, Requirement, design, evaluate_gains, trade_off
@@ -274,6 +275,8 @@ def test_a_design_is_written_as_strict_json(default_design: Design) -> None:
         ("alpha", -1.0),
         ("alpha", 1e-4),
         ("string_peak_max", 0.9),
+        ("loop", "Onboard"),
+        ("feed_forward", -3.0),
     ],
 )
 def test_requirement_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
@@ -290,6 +293,16 @@ def test_period_and_gains_are_checked() -> None:
         trade_off(period_s=-1.0)
     with pytest.raises(BadModelError, match=r"string_peak_max = 0\.5"):
         trade_off(period_s=PERIOD_S, string_peak_max=0.5)
+
+
+def test_unknown_choices_and_shares_are_refused() -> None:
+    unknown: Any = "lqr"
+    with pytest.raises(BadModelError, match="method = 'lqr'; wanted inclusion, graph-dk or graph-lqr"):
+        design(TRIANGLE, period_s=PERIOD_S, method=unknown)
+    with pytest.raises(BadModelError, match="maximise = 'lqr'"):
+        Criteria(maximise=unknown)
+    with pytest.raises(BadModelError, match="feed_forward = -3"):
+        evaluate_gains(TRIANGLE, (-EYE, 0.0 * EYE, EYE), period_s=PERIOD_S, feed_forward=-3.0)
 
 
 def test_importing_the_design_imports_no_slow_library() -> None:
