@@ -7,6 +7,7 @@ import numpy as np
 from gains.core._bracketing import highest
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.sampled._loop import HeldPlant, lifted_map, settled_covariance
+from gains.sampled.constant import spectral_radius
 
 
 def peak_gain(
@@ -42,14 +43,17 @@ def noise_gain(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, 
     """Return the largest standard deviation of a command where every state is measured with white noise of 1.
 
     u_k = K (x(t_k) + n_k) acts from t_k + `delay_s` for a period. n_k is independent from sample to sample and from
-    state to state, so the result is the H2 gain of the sampled loop to its noisiest command, `inf` if it is unstable.
-    Arguments as of `gains.sampled.constant.period_map`.
+    state to state, so the result is the H2 gain of the sampled loop to its noisiest command, `inf` if it is not
+    asymptotically stable. Arguments and exceptions as of `gains.sampled.constant.period_map`.
 
     x_{k+1} = 0.5 x_k − 0.5 n_k and u = −(x + n): the variance of x is 0.25 / (1 − 0.25), that of u 1 more.
 
     >>> round(noise_gain(np.zeros((1, 1)), np.eye(1), -np.eye(1), period_s=0.5, delay_s=0.0) ** 2, 9)
     1.333333333
     """
+    # noise may leave an unstable motion alone, and at the limit of stability its covariance only grows without end
+    if spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s) >= 1.0:
+        return float("inf")
     n = len(A)
     loop = lifted_map(HeldPlant(A, B, K, period_s), delay_s)
     entry = (loop - lifted_map(HeldPlant(A, B, 0.0 * K, period_s), delay_s))[:, :n]

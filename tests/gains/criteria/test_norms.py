@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
 from gains.criteria.figures import LoopFigures
 from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.rightmost import rightmost_root
@@ -129,3 +130,13 @@ def test_unstable_loop_has_no_gains() -> None:
     assert figures.spacing_gain_max_s2 == figures.noise_gain_max == np.inf
     assert figures.alpha_at_delay == 0.0
     assert noise_gain(PAIR.A, PAIR.B, K, period_s=0.02, delay_s=0.35) == np.inf
+
+
+def test_noise_gain_is_infinite_without_asymptotic_stability() -> None:
+    # x+ = -x; and a state that grows by itself, which noise does not reach
+    assert noise_gain(np.zeros((1, 1)), np.eye(1), -4.0 * np.eye(1), period_s=0.5, delay_s=0.0) == np.inf
+    A, B, alone = np.diag([1.0, 0.0]), np.array([[0.0], [1.0]]), np.array([[0.0, -1.0]])
+    assert noise_gain(A, B, alone, period_s=0.5, delay_s=0.0) == np.inf
+    for times in ({"period_s": -0.5, "delay_s": 0.0}, {"period_s": 0.5, "delay_s": -0.1}):
+        with pytest.raises(BadModelError, match="seconds"):
+            noise_gain(A, B, alone, **times)
