@@ -13,7 +13,8 @@ the rooms, for example `from gains.formation.pattern import leader_follower`. Ea
 * `criteria`: what a design can be asked for beside margin, robustness and decay, as figures of given gains.
 * `design`: from a requirement to gains.
 
-A module whose name begins with an underscore is internal. Matrices are arrays or nested lists; A, B and K are those of
+A module whose name begins with an underscore is internal. `gains.design` is the function; modules of that room are
+imported as `from gains.design import lqr`. Matrices are arrays or nested lists; A, B and K are those of
 x' = A x + B u, u = +K x. Times are in s, frequencies in rad/s, state matrices in 1/s.
 
 Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling the loop takes half a period more:

@@ -6,6 +6,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
+from numbers import Real
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -107,7 +108,7 @@ _POSITIVE = (
 def _check_positive(record: object, names: Iterable[str]) -> None:
     for name in names:
         wanted = getattr(record, name)
-        if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
+        if wanted is not None and not (isinstance(wanted, Real) and 0.0 < float(wanted) < inf):
             raise BadModelError(f"{name} = {wanted}; wanted a positive number")
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from math import log2
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,16 +63,25 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
 
 def positive_seconds(name: str, value: float) -> float:
     """`value` if it is positive and finite, else BadModelError with the name."""
-    if not (np.isfinite(value) and value > 0.0):
-        raise BadModelError(f"{name} is {value}; a positive number of seconds is wanted")
+    return positive_number(name, value, "number of seconds")
+
+
+def positive_number(name: str, value: float, what: str = "number") -> float:
+    """The same of another quantity."""
+    if not (isinstance(value, Real) and np.isfinite(value) and value > 0.0):
+        raise BadModelError(f"{name} is {_shown(value)}; a positive {what} is wanted")
     return float(value)
 
 
 def seconds(name: str, value: float) -> float:
     """`value` if it is finite and not negative, else BadModelError with the name."""
-    if not (np.isfinite(value) and value >= 0.0):
-        raise BadModelError(f"{name} is {value}; a number of seconds >= 0 is wanted")
+    if not (isinstance(value, Real) and np.isfinite(value) and value >= 0.0):
+        raise BadModelError(f"{name} is {_shown(value)}; a number of seconds >= 0 is wanted")
     return float(value)
+
+
+def _shown(value: object) -> str:
+    return str(value) if isinstance(value, Real) else repr(value)
 
 
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:

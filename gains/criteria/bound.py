@@ -23,7 +23,7 @@ from scipy import linalg
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import real_matrix, seconds, square_matrices
+from gains.core.structure import positive_number, real_matrix, seconds, square_matrices
 
 # ε of the price of commands as a share of the unit of the states: from here on four digits of α stay the same
 _PRICE = 1e-4
@@ -52,8 +52,7 @@ def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = 
         raise BadModelError(f"B has shape {entry.shape}; {n} rows are wanted, as A")
     if (rank := int(np.linalg.matrix_rank(entry))) < min(entry.shape):
         raise BadModelError(f"B has the rank {rank}; {min(entry.shape)} is wanted")
-    if not (np.isfinite(price) and price > 0.0):
-        raise BadModelError(f"price is {price}; a positive number is wanted")
+    positive_number("price", price)
     if delay_s == 0.0 and rank == n:
         return inf
     low, high = _LEAST_GAMMA, _LARGEST_GAMMA

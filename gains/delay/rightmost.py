@@ -52,9 +52,12 @@ def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> Com
     >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
     [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
     """
-    if len(terms) == 0:
+    try:
+        delays = np.array([float(delay_s) for _, delay_s in terms])
+    except (TypeError, ValueError) as error:
+        raise BadModelError("terms has an entry that is no pair; pairs (matrix, delay in s) are wanted") from error
+    if delays.size == 0:
         raise BadModelError("terms is empty; at least one pair (matrix, delay) is wanted")
-    delays = np.array([float(delay_s) for _, delay_s in terms])
     if not (np.isfinite(delays).all() and (delays >= 0.0).all()):
         raise BadModelError(f"terms have the delays {delays.tolist()}; finite numbers of seconds >= 0 are wanted")
     matrices = square_matrices(**{f"terms[{k}]": matrix for k, (matrix, _) in enumerate(terms)})

@@ -19,7 +19,7 @@ from gains.core._evolution import Rank, best_of
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import Requirement
-from gains.core.structure import positive_seconds
+from gains.core.structure import positive_number, positive_seconds
 from gains.criteria.figures import LoopFigures
 from gains.criteria.parts import Figures, Part, parts_of
 from gains.delay.constant import delay_margin
@@ -66,9 +66,12 @@ _FREQUENCIES, _HIGHEST, _NO_SLOWER, _RESOLUTION_S = 100, 5.0, 1e-6, 1e-4
 def fastest_at_delay(late_s: float) -> tuple[float, float]:
     """Return the (k1, k3) with which s² + (k1 s + k3) e^{−s late} decays fastest: a triple root at −(2 − √2) / late.
 
+    Raises BadModelError if the delay is not positive.
+
     >>> [round(gain, 4) for gain in fastest_at_delay(0.31)]
     [1.4876, 0.8233]
     """
+    positive_seconds("late_s", late_s)
     x = -_FASTEST
     k1 = -x * (2.0 + x) * exp(x)
     return k1 / late_s, -(x * x * exp(x) + k1 * x) / late_s**2
@@ -89,8 +92,10 @@ def longest_static_delay(
     >>> lag = Response(lag_s=0.15, velocity_gain_1_s=2.0)
     >>> [round(longest_static_delay(1.0, 0.02, response)[0], 3) for response in (None, lag)]
     [0.576, 0.315]
+
+    Raises BadModelError if the decay rate or the period is not positive.
     """
-    longest_s = _FASTEST / decay_1_s - period_s / 2.0
+    longest_s = _FASTEST / positive_number("decay_1_s", decay_1_s) - positive_seconds("period_s", period_s) / 2.0
     if response is None or longest_s <= 0.0:
         k1, k3 = fastest_at_delay(longest_s + period_s / 2.0)
         return longest_s, ScalarGains(k1, 0.0, k3, 0.0)

@@ -14,6 +14,7 @@ import numpy as np
 from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Criteria, Requirement
+from gains.core.structure import positive_number, positive_seconds
 from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import PatternGains, TreeGains, searched
 from gains.design.time_scale import time_scaled
@@ -41,11 +42,12 @@ def least_gains(decay_rate_1_s: float, period_s: float) -> tuple[float, float]:
 
     and the double root meets both with the least k1 and the least k3. With prediction a loop decays like this at every
     delay and the window is about 1 / (k1 + k3 tau^) to either side, so that no gains that decay as fast tolerate more.
+    BadModelError if the rate or the period is not positive.
 
     >>> [round(gain, 3) for gain in least_gains(1.735, 0.02)]
     [3.381, 2.908]
     """
-    p = exp(-decay_rate_1_s * period_s)
+    p = exp(-positive_number("decay_rate_1_s", decay_rate_1_s) * positive_seconds("period_s", period_s))
     return (1.0 - p) * (3.0 + p) / (2.0 * period_s), ((1.0 - p) / period_s) ** 2
 
 

@@ -92,6 +92,8 @@ def parse_model(text: str) -> DelayModel | HeldModel:
     >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
     ('tau', 0.1, Fraction(2, 1))
     """
+    if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise BadModelError(f"the model: read {type(text).__name__}, wanted JSON as a string")
     data = _parsed(text)
     if not isinstance(data, dict):
         _bad("the model", data, 'an object, as {"A0": [[..]], "A1": [[..]]}')

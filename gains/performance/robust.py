@@ -44,7 +44,8 @@ def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
 
     It is that of a leader and one follower. Arguments and exceptions as of `robustness`.
     """
-    gains = [np.atleast_2d(np.asarray(gain, dtype=float)) for gain in (K1, K2, K3)]
+    given = {"K1": K1, "K2": K2, "K3": K3}
+    gains = [real_matrix(name, np.atleast_2d(np.asarray(gain))) for name, gain in given.items()]
     A0, A1 = FormationModel((-1, 0), axes=len(gains[0])).ground_loop(*gains)
     return A0 + A1
 

@@ -25,6 +25,7 @@ INTERNAL_FUNCTIONS = {
     "gains.core.structure.block_diagonal",
     "gains.core.structure.distinct_blocks",
     "gains.core.structure.is_singular_for_any_delay",
+    "gains.core.structure.positive_number",
     "gains.core.structure.positive_seconds",
     "gains.core.structure.real_matrix",
     "gains.core.structure.seconds",
