@@ -33,8 +33,8 @@ GAINS = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
 _COLUMN = 10
 """Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
-_PARSES = 20
 _REHEARSED_S = 1.0
+_PARSES = 20
 """Times that pymavlink parses the frames of a tick after each flight."""
 _FRAMES, _REPEATS = 250, 20
 """Frames that the codecs are timed with, and how often."""

@@ -122,12 +122,7 @@ def _fly(
 
     if not stop(start_ns, start_ns):
         run(ports.sockets, lambda now: ports.send(fleet.step(ports.receive(), now)), lambda: fleet.next_event_ns, look)
-    say.changes(fleet.take_changes())
-    counters = fleet.counters + ports.sockets.counters
-    say.summary(counters, log)
-    if options.counters:
-        with contextlib.suppress(OSError):  # the flight is over, and the summary has been printed
-            options.counters.write_text(json.dumps(counters))
+    say.summary(fleet.counters + ports.sockets.counters, log, options.counters)
 
 
 def _links_only(
@@ -165,7 +160,7 @@ def _links_only(
         return stop(now_ns, links.last_heard_ns)
 
     run(peers.sockets, lambda now: peers.send(links.step(peers.receive(), now)), lambda: links.next_event_ns, look)
-    say.summary(links.counters + peers.sockets.counters, log)
+    say.summary(links.counters + peers.sockets.counters, log, options.counters)
 
 
 def _stop_rule(
@@ -216,15 +211,12 @@ class _Lines:
 
     def news(self, changes: list["Change"], sockets: "Sockets", log: "TruthLog | None") -> None:
         """Print what has happened since the last call, and write out the truth log."""
-        self.changes(changes)
-        self.lateness(sockets)
-        if log:
-            log.flush()
-
-    def changes(self, changes: list["Change"]) -> None:
         for change in changes:
             time_s = (change.time_ns - self._start_ns) / NS_PER_S
             self.line(f"{time_s:8.3f} s  vehicle {change.system_id}: {change.text}")
+        self.lateness(sockets)
+        if log:
+            log.flush()
 
     def lateness(self, sockets: "Sockets") -> None:
         """Report, at most once a second, datagrams that left so late that the links differ from the scenario's."""
@@ -237,11 +229,14 @@ class _Lines:
             )
             self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0
 
-    def summary(self, counters: Counter[str], log: "TruthLog | None") -> None:
-        """Print the last line: the counters."""
+    def summary(self, counters: Counter[str], log: "TruthLog | None", kept: Path | None) -> None:
+        """Print the last line, the counters, and keep them in a file as JSON."""
         counters += Counter(truth_lost=log.lost if log else 0)
         counts = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()))
         self.line(f"received: {counts or 'nothing'}")
+        if kept:
+            with contextlib.suppress(OSError):  # all is over, and the counters have been printed
+                kept.write_text(json.dumps(counters))
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """`sim-vehicles --links-only`: the scenario's links in front of vehicles that are somebody else's."""
 
+import json
 import signal
 import socket
 import subprocess
@@ -136,7 +137,10 @@ def running(
     station_at = f"127.0.0.1:{station.getsockname()[1]}"
     command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(folder / "links.toml"), "--links-only"]
     with subprocess.Popen(
-        [*command, "--vehicle-port", str(port), "--station", station_at, "--truth", str(folder / "truth")],
+        [
+            *(*command, "--vehicle-port", str(port), "--station", station_at),
+            *("--truth", str(folder / "truth"), "--counters", str(folder / "counters.json")),
+        ],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -195,6 +199,7 @@ def test_relayed_vehicles_and_station_communicate_and_truth_is_logged(tmp_path: 
     assert "refused_setup_signing 1" in out
     counted = dict(part.split() for part in out.split("received: ")[-1].strip().split(", "))
     assert int(counted["refused_second_source"]) >= 2  # before the silence, and the stranger
+    assert json.loads((tmp_path / "counters.json").read_text()) == {name: int(count) for name, count in counted.items()}
     truth = read_truth(tmp_path / "truth")
     for kind, delay_ns, count in ((LINK_UP, 30 * MS, 5), (LINK_DOWN, 10 * MS, 3)):
         own = truth[truth["kind"] == kind]
