@@ -26,6 +26,8 @@ _PARAMETERS = {
     PX4_COPTER.name: (("MPC_ACC_HOR", 1.0), ("MPC_JERK_AUTO", 1.0), ("COM_OF_LOSS_T", 1.0)),
 }
 """Acceleration, jerk and set-point time-out of each kind, and their units in m/s^2, m/s^3 and s."""
+_LEAST, _LARGEST = 0.1, 100.0
+"""A value outside of these, in those units, is not taken for a limit."""
 _ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
 
 
@@ -52,15 +54,15 @@ class ToldLimits:
         return None
 
     def take(self, fields: tuple[Any, ...]) -> None:
-        """Take in a PARAM_VALUE; a value that is not a positive number is ignored."""
+        """Take in a PARAM_VALUE; a value that no vehicle can mean is ignored."""
         value, _, _, field, _ = fields
         name = field.partition(b"\0")[0].decode("ascii", "replace")
-        names = [known for known, _ in _PARAMETERS.get(self._kind, ())]
-        if name not in self._asked or not (isfinite(value) and value > 0.0):
+        if name not in self._asked:
             return
-        self._not_before_ns = 0
-        at = names.index(name)
-        self._told[at] = round(value * _PARAMETERS[self._kind][at][1], 6)
+        at = [known for known, _ in _PARAMETERS[self._kind]].index(name)
+        limit = value * _PARAMETERS[self._kind][at][1]
+        if _LEAST <= limit <= _LARGEST:
+            self._not_before_ns, self._told[at] = 0, round(limit, 6)
 
     @property
     def acceleration_bound_m_s2(self) -> float:

@@ -87,6 +87,9 @@ def fly(
                 writer.event(
                     Event(time_s=station.scenario_time_s(clock_ns()), kind=record.END, text=station.end_reason)
                 )
+            except BaseException:
+                link.send(station.abandoned())
+                raise
             finally:
                 unwritten = writer.close()
             if unwritten:  # the observer would wait for the last event, which is among them

@@ -506,6 +506,14 @@ class RemoteVehicle:
             return None if due is None else self.encode(*due)
         return frame
 
+    def parting_command(self) -> bytes | None:
+        """The command to hold or land, of a station that cannot wait for the answer; None if it is not to be given."""
+        if self.address is None or self.ended:
+            return None
+        command, parameters = mode_command(self.kind, self.end_mode)
+        fields = mavlink.command_long(command, target_system=self.wire_id, confirmation=0, parameters=parameters)
+        return self.encode(mavlink.COMMAND_LONG, fields)
+
     def _next_command(self, now_ns: int) -> bytes | None:
         if now_ns < self._not_before_ns:
             return None

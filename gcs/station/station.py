@@ -132,6 +132,11 @@ class Station:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._journal.request_stop(reason)
 
+    def abandoned(self) -> Outbox:
+        """Commands to hold or land for every vehicle in flight: what a driver sends when an exception ends it."""
+        commands = [(vehicle.parting_command(), vehicle.address) for vehicle in self.vehicles]
+        return Outbox([(frame, address) for frame, address in commands if frame is not None and address is not None])
+
     def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> tuple[Outbox, Tick | None]:
         """Take datagrams in, but for those that a usual step has taken in, and do what is due.
 

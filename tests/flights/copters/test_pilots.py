@@ -181,6 +181,17 @@ def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     assert station.phase == "flying"
 
 
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_an_abandoned_flight_leaves_its_vehicles_holding(flavour: str) -> None:
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    station, pilots = fly(flown(flavour), flavour, {began_s + 2.0: mode}, until_s=began_s + 5.0)
+    now_ns = station.next_event_ns
+    pilots.step([(address[1], frame, now_ns) for frame, address in station.abandoned()], now_ns)
+    pilots.step([], now_ns + SECOND)
+    modes = {system_id: pilots.fleet.vehicle(system_id).craft.mode for system_id in (1, 2, 3)}  # pyright: ignore[reportAttributeAccessIssue]
+    assert modes == {1: RULES[flavour].hold_mode, 2: RULES[flavour].hold_mode, 3: mode}
+
+
 def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
     """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
     scenario = flown("ardupilot")

@@ -40,6 +40,12 @@ def test_a_vehicle_that_tells_nothing_is_asked_nine_times() -> None:
     assert limits.in_words().endswith("it tells no limits")
 
 
+def test_what_no_vehicle_can_mean_is_no_limit() -> None:
+    told = {b"WPNAV_ACCEL": 3.5e-43, b"PSC_JERK_XY": 1e30}  # the bytes of an integer, read as a float; a broken frame
+    limits, _ = answered(ARDUCOPTER, told)
+    assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3) == (2.0, 4.0)
+
+
 def test_what_was_not_asked_is_not_believed() -> None:
     limits = ToldLimits()
     limits.take((10.0, 3, 0, b"WPNAV_ACCEL\0", 9))
