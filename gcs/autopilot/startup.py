@@ -24,6 +24,8 @@ ground, set-points lead it to its altitude."""
 _LEFT_GROUND_M = 2.0
 _STANDBY = 3
 """MAV_STATE of a vehicle on the ground, ArduCopter's also while it is armed."""
+_OLD_MS = 1000
+"""A reported altitude older than this is carried on with the height of the local frame."""
 _HAS_FLOWN_M, _FLIES_M = 1.0, 2.0
 """An armed vehicle above the first has flown; one that has landed flies again above the second, farther from the drift
 of a barometer."""
@@ -56,6 +58,8 @@ class AutopilotStartup(Startup):
         self._flags: int | None = None
         self._local: tuple[int, float, float, float, float, float] | None = None
         """Newest local position: boot time in ms, north, east, down, and velocities north and east."""
+        self._reported: tuple[int, float] | None = None
+        """Boot time in ms of the newest altitude, and the altitude at which the local frame has its zero."""
         self._took_off_ns: int | None = None
         self._asked_hz = {mavlink.LOCAL_POSITION_NED: telemetry_hz, OPTIONAL: target_hz}
         self._rates: dict[float, float] = {}
@@ -85,6 +89,7 @@ class AutopilotStartup(Startup):
                 self.limits.take(fields)
             case mavlink.LOCAL_POSITION_NED:
                 self._local = fields[:6]
+                self._carry_altitude_on()
             case mavlink.GLOBAL_POSITION_INT:
                 self._global(fields)
             case mavlink.EKF_STATUS_REPORT:
@@ -116,6 +121,12 @@ class AutopilotStartup(Startup):
         elif above_home_m > _FLIES_M:
             self.has_landed = False
 
+    def _carry_altitude_on(self) -> None:
+        """Follow the height of the local frame while no altitude is reported: a climb towards an old one has no end."""
+        if self._local is not None and self._reported is not None and self._local[0] - self._reported[0] > _OLD_MS:
+            self.relative_altitude_m = self._reported[1] - self._local[3]
+            self._judge_ground()
+
     def _global(self, fields: tuple[Any, ...]) -> None:
         boot_ms, latitude, longitude, altitude_mm, relative_mm = fields[:5]
         if latitude == longitude == 0:
@@ -123,6 +134,8 @@ class AutopilotStartup(Startup):
         self.relative_altitude_m = relative_mm * 1e-3
         self._judge_ground()
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
+        if self._local is not None:
+            self._reported = boot_ms, self.relative_altitude_m + self._local[3]
         if self._local is not None and not self._origin_said and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
             since_s = (boot_ms - local_ms) * 1e-3

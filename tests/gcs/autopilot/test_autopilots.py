@@ -207,3 +207,13 @@ def test_a_position_of_zeros_is_none() -> None:
     startup.take(33, (10_000, 0, 0, 0, 0, 0, 0, 0, 0))
     assert startup.origin is None
     assert startup.relative_altitude_m is None
+
+
+def test_the_local_height_carries_an_altitude_on_that_is_old() -> None:
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.take(32, (10_000, 0.0, 0.0, -18.6, 0.0, 0.0, 0.0))
+    startup.take(33, (10_000, 470000000, 80000000, 400_000, 19_600, 0, 0, 0, 0))
+    startup.take(32, (10_900, 0.0, 0.0, -19.1, 0.0, 0.0, 0.0))
+    assert startup.relative_altitude_m == 19.6  # reported five times a second: another may follow
+    startup.take(32, (11_100, 0.0, 0.0, -19.3, 0.0, 0.0, 0.0))
+    assert startup.relative_altitude_m == pytest.approx(20.3)
