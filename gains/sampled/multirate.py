@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from math import ceil, floor, inf, isfinite
 
 import numpy as np
@@ -46,6 +47,12 @@ _MOST_PERIODS = 30.0
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
 _NEAR_ONE = 0.99
+# looks are closer where the radius of a common period exceeds this to the power of the commands in it
+_NEAR_ONE_COMMAND = 0.95
+# and where it reaches one by changing this many times as much as between the last looks
+_CHANGES = 3.0
+# instants at which a command meets a sample are dense if they are closer than this share of a step of looks
+_DENSE = 0.4
 
 
 @dataclass(frozen=True)
@@ -138,8 +145,8 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
 
     If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact. If it
     is longer than thirty slower periods, it is that of the slower period alone. Otherwise the least loop delay is
-    raised in small steps and peaks are refined, up to three times the margin of the continuous loop plus ten slower
-    periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
+    raised in steps, smaller ones where the loop comes near instability, up to three times the margin of the continuous
+    loop plus ten slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
     `gains.sampled.constant.sampled_delay_margin`.
 
     x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
@@ -256,7 +263,9 @@ def lifted_margin(plants: Sequence[SampledPlant], timing: Timing, *, near_s: flo
     for plant in plants:
         # without feedback one look tells; beyond the margin of another plant none does
         seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
-        found_s = first_unstable(lambda delay_s, plant=plant: lifted_radius(plant, timing, delay_s=delay_s), seen)
+        found_s = first_unstable(
+            lambda delay_s, plant=plant: lifted_radius(plant, timing, delay_s=delay_s), seen, timing
+        )
         least_s = min(least_s, found_s)
     return least_s
 
@@ -270,19 +279,41 @@ def _merged(instants: list[float], close_s: float) -> list[float]:
     return merged
 
 
-def first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
-    """The least delay at which the radius reaches one: 0 if at the first look, `inf` if at none."""
-    radii: list[float] = []
+def first_unstable(radius: Callable[[float], float], looks: Sequence[float], timing: Timing) -> float:
+    """The least mean loop delay at which the radius reaches one: 0 if at the first of `looks`, `inf` if at none.
+
+    The radius has a kink wherever an acting instant meets a sample. Where it comes near one, it is also read at every
+    kink and at three delays between: it may pass one and return within a single step of `looks`.
+    """
+    near, met, radii = _NEAR_ONE_COMMAND**timing.commands, list[tuple[float, float]](), list[float]()
     for i, look in enumerate(looks):
         radii.append(radius(look))
-        if radii[i] >= 1.0:
-            return _edge(radius, looks[i - 1], look) if i > 0 else 0.0
-        # a peak between two looks
-        if i > 1 and radii[i - 1] > _NEAR_ONE and radii[i - 2] < radii[i - 1] > radii[i]:
-            [peak_s] = peaks(np.vectorize(radius, [float]), np.array(looks[i - 2 : i - 1]), np.array([look])).tolist()
-            if radius(peak_s) >= 1.0:
-                return _edge(radius, looks[i - 2], peak_s)
+        found, highest, change = (look, radii[i]), max(radii[-2:]), max(radii[-3:]) - min(radii[-3:])
+        closely = i > 0 and highest > near and highest + _CHANGES * change > 1.0
+        closer = _closer_looks(looks[i - 1], look, timing) if closely else []
+        for delay_s, at in [*((delay_s, radius(delay_s)) for delay_s in closer), found]:
+            met.append((delay_s, at))
+            if at >= 1.0:
+                return _edge(radius, met[-2][0], delay_s) if len(met) > 1 else 0.0
+            *_, (first_s, first), (_, middle), (last_s, last) = [(0.0, inf)] * 2 + met
+            if middle > _NEAR_ONE and first < middle > last:  # a peak between these
+                [peak_s] = peaks(np.vectorize(radius, [float]), np.array([first_s]), np.array([last_s])).tolist()
+                if radius(peak_s) >= 1.0:
+                    return _edge(radius, first_s, peak_s)
     return inf
+
+
+def _closer_looks(after_s: float, before_s: float, timing: Timing) -> list[float]:
+    """Three delays between two; also those at which an acting instant may meet a sample, and three between each two.
+
+    Where these are dense, each moves few of many commands, and the radius hardly has a kink.
+    """
+    ends = [after_s, before_s]
+    if timing.step_s > _DENSE * (before_s - after_s):
+        first, last = (int((delay_s - timing.spread_s) / timing.step_s) for delay_s in ends)
+        kinks = (timing.spread_s + timing.step_s * np.arange(first, last + 2)).tolist()
+        ends[1:1] = [kink_s for kink_s in kinks if after_s < kink_s < before_s]
+    return np.concatenate([np.linspace(one, other, 5)[:-1] for one, other in pairwise(ends)])[1:].tolist()
 
 
 def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:

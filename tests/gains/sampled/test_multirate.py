@@ -148,6 +148,24 @@ def test_growth_is_zero_at_the_margin_and_negative_before(timing: Timing) -> Non
     assert multirate_growth_rate(*FOLLOWER, timing, delay_s=margin_s * (1.0 + 1e-6)) >= 0.0
 
 
+@pytest.mark.parametrize(
+    ("rates_hz", "gains", "crossings_s"),
+    [((9, 4), (2.729, -2.871), (0.27286, 0.28840, 0.30606)), ((9, 7), (3.871, -2.8508), (0.29677, 0.30148, 0.30466))],
+)
+def test_the_first_of_several_crossings_within_one_look_counts(
+    rates_hz: tuple[int, int], gains: tuple[float, float], crossings_s: tuple[float, float, float]
+) -> None:
+    loop, timing = (*FOLLOWER[:2], np.array([gains])), Timing(1.0 / rates_hz[0], 1.0 / rates_hz[1])
+    assert multirate_delay_margin(*loop, timing) == pytest.approx(crossings_s[0], abs=1e-5)
+    ends_s = (0.9 * crossings_s[0], *crossings_s, 1.05 * crossings_s[2])
+    for k, (after_s, before_s) in enumerate(pairwise(ends_s)):
+        delay_s = (after_s + before_s) / 2.0
+        assert (multirate_growth_rate(*loop, timing, delay_s=delay_s) > 0.0) == (k % 2 == 1)
+        states, _ = flown(loop, timing, np.array([1.0, 0.0]), 80.0, down_s=delay_s - timing.spread_s)
+        early, late = (np.linalg.norm(states[at : at + 20], axis=0).max() for at in (20, 60))
+        assert (late > early) == (k % 2 == 1)
+
+
 def test_the_mean_loop_delay_hides_almost_nothing_of_the_rates() -> None:
     """The margin of uneven rates is that of the slower one to its second order; the least delay would be 4 ms off."""
     for telemetry_s in (0.045, 0.04, 0.03, 0.0333):
