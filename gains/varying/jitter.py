@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._bracketing import highest
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
@@ -27,7 +28,7 @@ Cover = Literal["constant", "rate", "spread", "any", "none"]
 _FREQUENCIES_SCALING, _FREQUENCIES_GAIN, _FREQUENCIES_ROUGH = 60, 4000, 600
 # halvings in the bisection of the gain that a scaling reaches; the gain is read again afterwards, so few are enough
 _HALVINGS = 12
-# the gain is read on a grid: its peak may be higher by this share
+# the gain is searched: its peak may be higher by this share
 _GRID_ERROR = 1e-3
 
 
@@ -82,8 +83,9 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
 
     With A1 = B C and G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B the loop is stable for a spread below 1 / (g max over
     omega of ||D G(j omega) D^{-1}||), for any D; g = 1 if the rate is at most 1, else sqrt(7/4) (proof in
-    docs/explanation/delay-margin.md). The maximum is read from a fine grid, with a part in a thousand allowed for what
-    lies between: a search, not a proof. If `scaled` is False, D = I and the grid is coarse, as a search needs it.
+    docs/explanation/delay-margin.md). The maximum is searched on a fine grid and refined, with a part in a thousand
+    allowed for what is missed: a search, not a proof. If `scaled` is False, D = I and the grid is coarse, as a search
+    needs it.
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
@@ -114,13 +116,18 @@ def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled:
     r = B.shape[1]
     if r == 0:
         return inf
-    highest = highest_frequency((now, late))
-    coarse = highest * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
+    top = highest_frequency((now, late))
+    coarse = top * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
     D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if scaled and r > 1 else np.eye(r)
     count = _FREQUENCIES_GAIN if scaled else _FREQUENCIES_ROUGH
-    fine = np.concatenate([highest * np.logspace(-4.0, 3.0, count), np.linspace(0.0, highest, count)])
-    loops = np.concatenate([_loop_gains(now, late, B, C, mean_s, fine), (C @ B)[np.newaxis]])
-    largest = float(spectral_norms(D @ loops @ np.linalg.inv(D)).max())
+    fine = np.union1d(top * np.logspace(-4.0, 3.0, count), np.linspace(0.0, top, count))
+    inverse = np.linalg.inv(D)
+
+    def gain(omega: FloatArray) -> FloatArray:
+        return spectral_norms(D @ _loop_gains(now, late, B, C, mean_s, omega) @ inverse)
+
+    # near the margin a peak is far narrower than the grid; at high frequencies the gain tends to that of C B
+    largest = max(highest(gain, fine)[1], float(np.linalg.norm(D @ C @ B @ inverse, 2)))
     return 1.0 / (largest * (1.0 + _GRID_ERROR))
 
 

@@ -160,6 +160,15 @@ def test_spread_shrinks_to_nothing_at_the_margin() -> None:
     assert spread_bound(*FOLLOWER, mean_s=1.01 * margin_s) == 0.0
 
 
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize("share", [1e-3, 1e-5, 1e-7])
+def test_spread_near_the_margin_stays_below_it(share: float, scaled: bool) -> None:
+    # a constant delay at the end of the spread is a variation too
+    margin_s = delay_margin(*FOLLOWER)
+    mean_s = (1.0 - share) * margin_s
+    assert mean_s + spread_bound(*FOLLOWER, mean_s=mean_s, rate=1.0, scaled=scaled) <= margin_s
+
+
 CELLS = 40
 
 
