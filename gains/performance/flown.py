@@ -233,7 +233,7 @@ class FlownLoop:
         turns = np.abs(turning) > _NOTHING * k1 * omega
         c = excess / np.where(turns, size, 1.0)
         end = np.arccos(np.clip(c, -1.0, 1.0))
-        angle = np.where(np.abs(psi) <= end, end - psi, 0.0)
+        angle = np.where(turns & (np.abs(psi) <= end), end - psi, 0.0)
         never = np.where(turns, c <= -1.0, excess <= _ROUNDING * k1**2 * x)
         return np.where(never, 0.0, omega / np.maximum(angle, _ROUNDING * omega))
 

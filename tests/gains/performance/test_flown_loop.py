@@ -141,6 +141,12 @@ def test_the_closed_form_limit_is_where_the_peak_passes_it(gains: ScalarGains, l
         assert max(beyond) > peak
 
 
+def test_without_the_velocity_in_front_no_delay_changes_onboard_growth() -> None:
+    # |1 / (s² + s + 1)| peaks at 2 / √3 = 1.1547
+    flown = FlownLoop(ScalarGains(1.0, 0.0, 1.0, 0.0), FlownTiming(inf, PERIOD_S, "onboard"))
+    assert (flown.string_limit_s(1.15), flown.string_limit_s(1.16)) == (0.0, inf)
+
+
 @settings(max_examples=25, deadline=None)
 @given(gains=gains_of_stable_loops(), share=st.floats(0.0, 0.95))
 @example(gains=GAINS, share=0.66)
