@@ -22,7 +22,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
 from gains.delay._loci import delay_loci, sweep_frequencies, unit_crossings, unit_gain_roots, with_extrema
-from gains.sampled._loop import SampledPlant, block_radius, split_delay
+from gains.sampled._loop import SampledPlant, block_radius, lifted_map, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
 _FRACTIONS = 8
@@ -31,12 +31,15 @@ _REFINEMENTS = (1, 4, 16)
 _LARGEST_CHECK = 120
 # where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 1e-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
-# a radius this near to one is no evidence: at a whole period it may pass one with no slope
-_AT_ONE = 1e-11
+# a radius this near to one is no evidence: at a whole period it may pass one with no slope; at a multiple eigenvalue,
+# one within its rounding, up to this
+_AT_ONE, _MOST_ERROR = 1e-11, 1e-3
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
 # a residual this small beside its terms is rounding, and a delay this close to another (in periods) the same
 _ROUNDING, _SAME_PLACE = 1e-11, 1e-6
+# where Newton's method ends without settling, a residual this small beside its terms is that of a multiple root
+_SOLVED = 1e-15
 
 
 @lru_cache(maxsize=256)
@@ -161,8 +164,9 @@ def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
     The residual has a kink there, so a step may lead away from a solution: a start that is a solution is kept. A start
     that nearly is one is tried again from both sides.
     """
-    found_s, beside_s = _newton(plant, delay_s, angle), _SAME_PLACE * plant.period_s
+    beside_s = _SAME_PLACE * plant.period_s
     from_whole_s = abs(delay_s - round(delay_s / plant.period_s) * plant.period_s)
+    found_s = _newton(plant, delay_s, angle, multiple=from_whole_s > beside_s)
     if abs(found_s - delay_s) < beside_s or from_whole_s > beside_s:
         return found_s
     residual, terms, _ = _residual(plant, delay_s, angle)
@@ -172,8 +176,11 @@ def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
     return delay_s if relative <= _ROUNDING else found_s
 
 
-def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
-    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by."""
+def _newton(plant: SampledPlant, delay_s: float, angle: float, *, multiple: bool = False) -> float:
+    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
+
+    Beside a multiple root steps shrink slowly, and stop far above 1e-9. Such ends count if `multiple`.
+    """
     start_s, previous = delay_s, inf
     for _ in range(30):
         residual, _, (by_angle, by_delay) = _residual(plant, delay_s, angle)
@@ -190,7 +197,9 @@ def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
         if step < 1e-14 or (step < 1e-9 and step >= 0.5 * previous):
             return delay_s
         previous = step
-    return np.nan
+    residual, terms, _ = _residual(plant, delay_s, angle)
+    solved = multiple and residual <= _SOLVED * sum(float(np.linalg.norm(term)) for term in terms)
+    return delay_s if solved else np.nan
 
 
 def _residual(
@@ -252,9 +261,12 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
     if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:
         return ""
     radii = {fraction: block_radius(plant, fraction * known_s) for fraction in _BELOW}
-    wrong = next((fraction for fraction, radius in radii.items() if radius >= 1.0 + _AT_ONE), None)
+    above = [fraction for fraction, radius in radii.items() if radius >= 1.0 + _AT_ONE]
+    wrong = next((each for each in above if radii[each] >= 1.0 + _radius_error(plant, each * known_s)), None)
     if wrong is None and margin_s < inf:
         radii[_ABOVE], least = block_radius(plant, _ABOVE * known_s), 1.0 - _AT_ONE
+        if radii[_ABOVE] < least:
+            least = min(least, 1.0 - _radius_error(plant, _ABOVE * known_s))
         # it may touch one at a whole period and be smaller on both sides
         if radii[_ABOVE] < least and block_radius(plant, known_s) < least:
             wrong = _ABOVE
@@ -264,3 +276,13 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
         f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
         f"of the one-period map at {wrong * known_s} s is {radii[wrong]}"
     )
+
+
+def _radius_error(plant: SampledPlant, delay_s: float) -> float:
+    """By how much rounding may have moved the spectral radius: far if its eigenvalue is nearly a multiple one."""
+    step = lifted_map(plant, delay_s)
+    values, vectors = np.linalg.eig(step)
+    k = int(np.argmax(np.abs(values)))
+    left = np.linalg.svd(step - values[k] * np.eye(len(step)))[0][:, -1]
+    angle = abs(complex(left.conj() @ vectors[:, k]))
+    return min(len(step) * float(np.finfo(np.float64).eps * np.linalg.norm(step)) / max(angle, 1e-300), _MOST_ERROR)

@@ -125,6 +125,17 @@ def test_decoupled_axes_have_the_margin_of_one() -> None:
     assert coupled_s == pytest.approx(first_unstable_delay_s((A, B, K), period_s=0.02, up_to_s=1.0), rel=1e-10)
 
 
+@pytest.mark.parametrize("vehicles", [2, 3])
+@pytest.mark.parametrize("period_s", [0.02, 0.1, 0.5])
+def test_equal_followers_in_mixed_coordinates_have_the_margin_of_one(vehicles: int, period_s: float) -> None:
+    # a chain, each follower driven by the one in front: one double or triple root, which rounding spreads by its root
+    A, B, K = (np.kron(np.eye(vehicles), matrix) for matrix in FOLLOWER)
+    K += np.kron(np.eye(vehicles, k=-1), [[0.2, 0.5]])
+    mixed = np.linalg.qr(np.random.default_rng(1).standard_normal((2 * vehicles, 2 * vehicles)))[0]
+    margin_s = sampled_delay_margin(mixed @ A @ mixed.T, mixed @ B, K @ mixed.T, period_s=period_s)
+    assert margin_s == pytest.approx(sampled_delay_margin(*FOLLOWER, period_s=period_s), rel=1e-4)
+
+
 @pytest.mark.parametrize(
     ("loop", "period_s", "expected_periods"),
     [
