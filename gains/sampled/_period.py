@@ -26,6 +26,8 @@ _RATIO, _STEP = 1.03, 0.02
 # e^{A T} is zero to rounding where its slowest motion has decayed by e^-40, and hides the rest where one has grown by
 # e^30
 _DECAYED, _GROWN = 40.0, 30.0
+# a motion of the plant that is this slow beside its norm is an integrator, or so far away that e^{A T} is rounding
+_STILL = 1e-12
 # a double eigenvalue of the map, as of an undamped plant sampled once a turn, is known to sqrt(eps)
 _TOUCH = 1e-7
 
@@ -106,7 +108,7 @@ def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool
 def _last_period(A: FloatArray) -> tuple[float, bool]:
     """The period (s) beyond which nothing new is seen, and whether all motions of the plant have died out there."""
     slowest = float(np.linalg.eigvals(A).real.max())
-    if slowest == 0.0:
+    if abs(slowest) <= _STILL * float(np.linalg.norm(A)):
         return inf, False
     return (_DECAYED / -slowest, True) if slowest < 0.0 else (_GROWN / slowest, False)
 

@@ -192,6 +192,14 @@ def test_period_limit_of_a_follower_is_the_closed_form() -> None:
     assert analyse_period(FOLLOWER[0], FOLLOWER[1], [[9.0, -1.0]]).limit_s == pytest.approx(2.0 / 9.0, rel=1e-12)
 
 
+@pytest.mark.parametrize("angle", np.linspace(0.1, 1.5, 15))
+def test_period_limit_of_a_follower_is_the_same_in_turned_coordinates(angle: float) -> None:
+    # rounding makes of two integrators a motion that is too slow to be seen within 1e16 s
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    A, B, K = FOLLOWER
+    assert analyse_period(turn @ A @ turn.T, turn @ B, K @ turn.T).limit_s == pytest.approx(2.0, rel=1e-10)
+
+
 def test_a_stable_plant_with_small_gain_has_no_period_limit() -> None:
     assert analyse_period([[-1.0]], [[1.0]], [[-0.5]]).limit_s == inf
 
