@@ -138,7 +138,10 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     unit = _common_divisor([term.multiple for term in model.terms])
     # in the common divisor of the delays; the unknown is that divided by `unit`
-    read = [DelayedTerm(term.matrix, term.fixed_s, int(term.multiple / unit)) for term in model.terms]
+    read = [
+        DelayedTerm(term.matrix, term.fixed_s if term.matrix.any() else 0.0, int(term.multiple / unit))
+        for term in model.terms
+    ]
     most = max(term.multiple for term in read)
     if most > _MOST_STEPS:
         raise BadModelError(

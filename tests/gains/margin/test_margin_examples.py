@@ -26,6 +26,16 @@ KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
         {"terms": [{"A": [[0.0]], "delay": 0}, {"A": [[-1.0]], "delay": "2*tau"}]},
         [[0.0, pi / 4]],
     ),
+    "x'' = -2 x + x(t - tau), on the axis at 0, beside a link that carries nothing: pi / sqrt(3)": (
+        {
+            "terms": [
+                {"A": [[0, 1], [-2, 0]], "delay": 0},
+                {"A": [[0, 0], [1, 0]], "delay": "tau"},
+                {"A": [[0, 0], [0, 0]], "delay": "0.8 + tau"},
+            ]
+        },
+        [[0.0, pi / 3**0.5]],
+    ),
     "sampled loop, the period unknown": (
         {"A": [[0, 1], [0, -0.1]], "B": [[0], [0.1]], "K": [[-3.75, -11.5]], "hold": True},
         [[0.0, 1.7294142794798775]],
