@@ -239,7 +239,7 @@ def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) 
 
 
 class _Heard(NamedTuple):
-    """Times at which states arrived at the station, ascending, and sampling time of the newest one then, both (k,) in s."""
+    """Times of arrival of states at the station, ascending, and the sampling time of the newest so far, both (k,)."""
 
     arrived_s: FloatArray
     newest_s: FloatArray
