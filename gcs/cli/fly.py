@@ -33,17 +33,17 @@ def fly(
         typer.Option(metavar="ID", help="leave this vehicle out and fly the formation around it; may be repeated"),
     ] = None,
     connect: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="listen here and fly vehicles that are already running")
+        str | None, typer.Option(metavar="HOST:PORT", help="listen on this address and fly vehicles already running")
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help=f"listen here for the vehicles that gcs fly starts; default {LISTEN}"),
+        typer.Option(metavar="HOST:PORT", help=f"listen here for vehicles that gcs fly starts; default {LISTEN}"),
     ] = None,
     mirror: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="forward all frames to another ground station, read-only")
     ] = None,
     mirror_commands: Annotated[
-        bool, typer.Option("--mirror-commands", help="with --mirror: pass that station's frames on to the vehicles")
+        bool, typer.Option("--mirror-commands", help="with --mirror: forward that station's frames to the vehicles")
     ] = False,
     key: options.KeyFile = None,
     allow_unstable: options.AllowUnstable = False,
@@ -57,10 +57,10 @@ def fly(
         typer.Option(metavar="new|HOST:PORT", help="show the flight in a new Rerun viewer, or in the one at HOST:PORT"),
     ] = None,
     assert_headroom: Annotated[
-        float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom was ever lower")
+        float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom ever fell below this")
     ] = None,
     assert_settled: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="exit with code 1 if errors had not settled by then")
+        float | None, typer.Option(metavar="SECONDS", help="exit with code 1 if errors take longer to settle")
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
     out: options.OutFolder = None,
@@ -128,7 +128,7 @@ def fly(
                 folder,
                 show_table=not as_json,
                 fleet=CONNECTED if connect is not None else TAKEN_OVER if taken_over else "",
-                outlive_station=options.address(*at)[1] != 0,  # nobody listens again at a port that the system chose
+                outlive_station=options.address(*at)[1] != 0,  # no later station listens at a port the system chose
                 key_file=key,
                 mirror=to,
                 viewer=viewer,
@@ -142,7 +142,7 @@ def fly(
 
 
 def _flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable: bool) -> "tuple[Design, FlightPlan]":
-    """Design and plan as they are flown; an unstable loop is refused, or the user is warned."""
+    """Design and plan as flown. An unstable loop is refused, or only warned about if `allow_unstable`."""
     from gcs.drive import preflight
 
     if (unstable := preflight.unstable_loop(plan)) is not None:
@@ -164,7 +164,7 @@ def _refuse_unusable(
 
 
 def _passed(summary: "Summary", least_headroom: float | None, settled_s: float | None, junit: Path | None) -> bool:
-    """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
+    """Check the flight, and print one line for each assertion that fails; the summary shows the other checks."""
     from gcs.runs.junit import Check, write_junit
 
     stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"

@@ -1,4 +1,4 @@
-"""The options of `gcs design --front`, `--at` and of `--links-of`, and what they print."""
+"""The options `--front` and `--at` of `gcs design`, and `--links-of`, with their printed output."""
 
 import os
 from pathlib import Path
@@ -24,22 +24,22 @@ LinksOf = Annotated[
     typer.Option(
         "--links-of",
         metavar="RUN|FILE.tlog",
-        help="choose the gains for the links that this run or log shows; the scenario keeps its own links",
+        help="choose gains for the links measured in this run or log; the scenario keeps its own links",
     ),
 ]
 Front = Annotated[
     bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
 ]
 At = Annotated[
-    float | None, typer.Option("--at", metavar="SECONDS", help="use the point of the front at this loop delay")
+    float | None, typer.Option("--at", metavar="SECONDS", help="take the gains of the front at this loop delay")
 ]
-Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: what to maximise there")]
+Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: the quantity to maximise")]
 Predict = Annotated[
     Literal["on", "off"] | None, typer.Option(help="with --at: predict over that delay or not; default the better")
 ]
 ComparePrediction = Annotated[
     bool,
-    typer.Option("--compare-prediction", help="show the loop delay tolerated with prediction, and its price"),
+    typer.Option("--compare-prediction", help="show the loop delay tolerated with prediction, and its cost"),
 ]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE.svg|png", help="with --front: draw it into this file")]
 Save = Annotated[
@@ -56,9 +56,9 @@ _GAINS = {
 
 
 def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, LinkPart | None]":
-    """The scenario with gains for the links of --links-of, and why these; unchanged without it.
+    """The scenario with gains for the links of --links-of, and the reason for the choice; unchanged without it.
 
-    A scenario without `for_link` gives up its gains, its method and its requirements on margin, alpha and decay.
+    A scenario without `for_link` loses its gains, its method and its requirements on margin, alpha and decay.
     """
     if links_of is None:
         return scenario, None
@@ -76,9 +76,9 @@ def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, 
 def chosen_now(
     scenario: "Scenario", link: "StationSocket | None", there: "Presence | None", key_file: Path | None, *, shown: bool
 ) -> "tuple[Scenario, LinkPart]":
-    """The scenario with gains for its links, which are measured now, and why these; without a socket in virtual time.
+    """The scenario with gains for its links, measured now (without `link`, in virtual time), and why these gains.
 
-    `there` finds simulated vehicles that are present already, or else they are started; None if others are to be flown.
+    `there` finds running simulated vehicles; if there are none, they are started. None if others are to be flown.
     """
     from gcs.watch.before_flight import measured_now
     from gcs.watch.for_link import best_for
@@ -108,7 +108,7 @@ def show_front(scenario: "Scenario", method: str | None, picture_file: Path | No
 
 
 def _refuse_graph_dk(scenario: "Scenario") -> None:
-    """Refuse the method that searches no gains for a delay, whether the scenario or --method names it."""
+    """Refuse graph-dk, which cannot search gains for a delay, whether the scenario or --method names it."""
     if scenario.control.method == "graph-dk":
         wanted = "--method inclusion or graph-lqr, with --front or --at"
         raise InputError(f"{scenario.name}: read method graph-dk, wanted {wanted}")
@@ -182,7 +182,7 @@ def print_comparison(found: "Comparison") -> None:
 def scenario_at(
     scenario: "Scenario", delay_s: float, maximise: str, predict: Literal["on", "off"] | None
 ) -> "Scenario":
-    """The scenario with the gains of a point of the front, by its method."""
+    """The scenario with the gains of one point of the front, by the scenario's method."""
     from gcs.studies.front import point_at
 
     within("--at", delay_s, 0.001, 10.0, "seconds")

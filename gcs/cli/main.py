@@ -1,6 +1,6 @@
-"""The `gcs` command: its subcommands, and the line and exit code that each kind of error becomes.
+"""The `gcs` command: its subcommands, and the one-line message and exit code of each kind of error.
 
-Each command imports what it needs when it runs: cvxpy, rerun and matplotlib are slow, and --help must be quick.
+Each command does its imports when it runs: cvxpy, rerun and matplotlib are slow, and --help must be quick.
 """
 
 import gc
@@ -23,7 +23,7 @@ from gcs.output import DISK_FULL
 
 
 class _Group(TyperGroup):
-    """Passes an interrupt on, of which Typer makes an exit without a word."""
+    """Turns an interrupt into an Abort, because Typer would exit on it silently."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -94,12 +94,12 @@ def main() -> None:
         if error.filename is None and error.errno not in DISK_FULL:
             raise  # not about a file that the user named
         code = _bad_input(f"{error.filename or 'write'}: {error.strerror}, wanted a file or folder that can be used")
-    gc.freeze()  # the interpreter would look for garbage once more as it ends: a tenth of a second
+    gc.freeze()  # skip the interpreter's last garbage collection, which takes a tenth of a second
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _misread(error: typer.TyperException) -> str:
-    """What was read and what was wanted, where a value is of the wrong kind or an option is misspelt."""
+    """The message for a value of the wrong kind, with what was read and wanted, or for a misspelt option."""
     from pydantic import ValidationError
 
     if near := getattr(error, "possibilities", None):

@@ -1,4 +1,4 @@
-"""What `gcs margin` reads and prints: the delay margin of a JSON model or of a scenario's loop.
+"""Input and output of `gcs margin`: the delay margin of a JSON model or of a scenario's loop.
 
 The mathematics is in `gains.margin.loop_margin`.
 """
@@ -25,9 +25,9 @@ if TYPE_CHECKING:  # it imports the schema of scenarios, which a JSON model does
     from gcs.plan.design import PredictionPart
 
 _ROWS = 20
-"""Most rows of a table."""
+"""Maximum number of rows in a table."""
 _PART = 1 << 18
-"""Characters of a file that are read at once."""
+"""Number of characters read from a file at once."""
 
 
 class ModelFileError(BadModelError):
@@ -42,7 +42,7 @@ class ScenarioMargin:
     loop: str
     delay_margin_sampled_s: float | None
     prediction: "PredictionPart | None"
-    """The mismatch windows of a station that predicts; the margins are those without prediction."""
+    """The mismatch windows of a station that predicts; the margins above are those without prediction."""
 
 
 def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
@@ -66,7 +66,7 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
 
 
 def _json_of(file: Path) -> str:
-    """The text without its many zeros: that of 1,000 vehicles has 40 MB."""
+    """The text with its many zeros shortened: the model of 1,000 vehicles takes 40 MB."""
     with file.open(encoding="utf-8-sig") as text:
         return "".join(with_short_zeros(part) for part in iter(partial(text.read, _PART), ""))
 
@@ -121,7 +121,7 @@ def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargi
 
 
 def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dict[str, Any]:
-    """The JSON of a margin: null for an unbounded number; a crossing has only the fields that are known."""
+    """The JSON fields of a margin: null for an unbounded number; a crossing has only its known fields."""
     if isinstance(found, ScenarioMargin):
         flown = {"loop": found.loop, "delay_margin_sampled_s": found.delay_margin_sampled_s}
         predicted = {} if found.prediction is None else {"prediction": found.prediction.to_dict()}
@@ -149,7 +149,7 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
         console.print(f"{verdict}: rightmost root {root.real:.6g} +- {root.imag:.6g}j 1/s")
         return
     by, margin = "", found.margin if isinstance(found, ScenarioMargin) else found
-    if isinstance(found, ScenarioMargin):  # first what is flown, then its model
+    if isinstance(found, ScenarioMargin):  # first the loop as flown, then its model
         loop, flown, *more = margin.notes
         console.print(f"{flown}\n{loop}")
         by, margin = "continuous model: ", replace(margin, notes=tuple(more))
@@ -194,7 +194,7 @@ def _verdict_lines(margin: LoopMargin) -> list[str]:
 
 
 def _end(margin: LoopMargin, end_s: float) -> str:
-    """One end of a window, with as many digits as are known of the crossing there."""
+    """One end of a window, with as many digits as the crossing there is known to."""
     if not isfinite(end_s):
         return "any delay"
     error_s = 0.0

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 LoopPlace = Literal["ground", "onboard"]
-"""Where the loop is closed, as `control.loop` of a scenario."""
+"""Where the loop is closed, as in `control.loop` of a scenario."""
 
 
 def _shipped(incomplete: str) -> list[str]:
-    """The shipped scenarios that a shell offers for the beginning of a name; it offers files besides."""
+    """The shipped scenarios that shell completion offers for the beginning of a name, in addition to files."""
     from scenarios.shipped import names
 
     return [name for name in names() if name.startswith(incomplete)]
@@ -37,7 +37,7 @@ ScenarioFile = Annotated[
     Path,
     typer.Argument(
         metavar="SCENARIO",
-        help="scenario file, or the name of one that ships (see gcs scenarios)",
+        help="scenario file, or the name of a shipped scenario (see gcs scenarios)",
         autocompletion=_shipped,
     ),
 ]
@@ -87,7 +87,7 @@ def print_json(result: Any) -> None:
 
 
 def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> None:
-    """Print a result: as JSON, or in the way that `show` does."""
+    """Print a result: as JSON, or with `show`."""
     if as_json:
         print_json(result)
     else:
@@ -95,7 +95,7 @@ def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> 
 
 
 def live_viewer(text: str) -> str:
-    """The URL of the viewer that --live names, or of a new one."""
+    """The URL of the viewer that --live names, which may be a new one."""
     from gcs.views.viewer import new_viewer, viewer_url
 
     return new_viewer() if text == "new" else viewer_url(*address("--live", text))
@@ -112,10 +112,10 @@ def load_scenario(
 ) -> "Scenario":
     """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
-    The vehicles with the system ids `left_out` are left out; `links` names a profile that replaces its links, and
-    `link_delay_s` their delay, each way. A scenario that names code is refused unless `allow_code`, which may be what
-    is wanted instead. Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop, without
-    these vehicles, or with these links.
+    `left_out` are system ids of vehicles to leave out, `links` names a profile that replaces its links, and
+    `link_delay_s` replaces their delay, each way. A scenario that names code is refused unless `allow_code` is true; a
+    text there says in the refusal what is wanted instead. Raises scenarios.errors.ScenarioError if the file cannot be
+    used, or not with this loop, without these vehicles, or with these links.
     """
     from scenarios.files import load, with_loop, with_profile
     from scenarios.left_out import without
@@ -142,7 +142,7 @@ def within(option: str, value: float, least: float, most: float, unit: str = "")
 
 
 def say_if_first_flight() -> None:
-    """Say on a terminal why the first flight on a machine begins late."""
+    """Explain on a terminal why the first flight on a machine starts late."""
     from scenarios.kernel import any_kept
 
     if sys.stderr.isatty() and not any_kept():
@@ -150,9 +150,9 @@ def say_if_first_flight() -> None:
 
 
 def refuse(file: Path, *findings: str | None, in_file: bool = True) -> None:
-    """Refuse a scenario for the first of these findings that is not None.
+    """Refuse a scenario with the first of these findings that is not None.
 
-    It is shown with its line in the file, unless an option replaced what is written there (not `in_file`).
+    The message names the line in the file, unless an option replaced what is written there (not `in_file`).
     """
     from scenarios.files import with_line
     from scenarios.shipped import located
@@ -163,7 +163,7 @@ def refuse(file: Path, *findings: str | None, in_file: bool = True) -> None:
 
 
 def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
-    """Refuse a scenario for a finding, or only warn of it if the user allows it."""
+    """Refuse a scenario for a finding, or only warn about it if `allow`."""
     if not allow:
         refuse(file, finding)
     warn(file, finding)
@@ -174,7 +174,7 @@ def warn(file: Path, finding: str) -> None:
 
 
 def over_own_links(file: Path, design: "Design", plan: "FlightPlan") -> "tuple[Design, FlightPlan]":
-    """Design and plan with their margins over the scenario's own links; says so if that changes them."""
+    """Design and plan with their margins over the scenario's own links; warns if these differ."""
     from gcs.plan import planner
     from gcs.views.console import ms_text
 
@@ -197,7 +197,7 @@ def out_folder(out: Path, wanted: str = "a new or empty folder", option: str = "
 
 
 def refuse_out(out: Path, wanted: str = "a new or empty folder") -> None:
-    """Refuse an --out that cannot be used, before any work is done for it; leaves no new folder behind."""
+    """Refuse an unusable --out before any work is done for it; leaves no new folder behind."""
     new = not out.exists()
     out_folder(out, wanted)
     if new:
@@ -221,7 +221,7 @@ def run_folder(out: Path | None, name: str) -> Path:
 
 
 def out_file(option: str, file: Path) -> None:
-    """Refuse a file that cannot be written before any work is done for it; creates its folder."""
+    """Refuse an unwritable file before any work is done for it; creates its folder."""
     with usable(f"{option}: {file}", "a file that can be written"):
         new = not file.exists()
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -243,7 +243,7 @@ def address(option: str, text: str) -> tuple[str, int]:
 
 
 def listening(option: str, text: str, guard: "Guard | None" = None, networks: Sequence[int] = (0,)) -> "StationSocket":
-    """The socket that listens to networks at the HOST:PORT given to an option, see `StationSocket`."""
+    """Open the socket that listens to the networks at the HOST:PORT given to an option (see `StationSocket`)."""
     from gcs.drive.udp import StationSocket
 
     host, port = address(option, text)
@@ -253,7 +253,7 @@ def listening(option: str, text: str, guard: "Guard | None" = None, networks: Se
 
 
 def warn_if_open(link: "StationSocket") -> None:
-    """Warn of a socket that other machines can reach while nothing is signed."""
+    """Warn if other machines can reach the socket while nothing is signed."""
     host, port = link.address
     if link.guard is None and not ip_address(host).is_loopback:
         text = "other machines can reach it and nothing is signed; gcs key FILE makes a key for --key"
@@ -261,7 +261,7 @@ def warn_if_open(link: "StationSocket") -> None:
 
 
 def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
-    """The guard that signs and verifies with the key in a file; None if no key was given."""
+    """The guard that signs and verifies frames with the key in a file; None if no key was given."""
     if key is None:
         return None
     from gcs.drive.guard import open_guard
@@ -271,7 +271,7 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
 
 
 def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
-    """The mirror that --mirror HOST:PORT asks for; `link` is where this station itself listens."""
+    """Open the mirror for --mirror HOST:PORT; `link` is the socket on which this station itself listens."""
     from gcs.drive.mirror import Mirror
 
     host, port = address("--mirror", text)
@@ -297,7 +297,7 @@ def refuse_headroom(least: float | None) -> None:
 
 
 def unmet_headroom(found: float | None, least: float) -> str:
-    """What --assert-headroom wanted, in words; empty if the headroom found is enough."""
+    """The message for an --assert-headroom that does not hold; empty if the headroom found is enough."""
     if found is not None and found >= least:
         return ""
     read = "no headroom" if found is None else beyond(100.0 * found, 100.0 * least, 1) + "%"

@@ -1,4 +1,4 @@
-"""What `gcs stress`, `compare`, `bench` and `capacity` print, and what `gcs stress` checks for CI."""
+"""The output of `gcs stress`, `compare`, `bench` and `capacity`, and the checks of `gcs stress` for CI."""
 
 from collections.abc import Callable
 from functools import partial
@@ -31,7 +31,7 @@ _ms = partial(ms_text, form=".2f")
 _whole_ms = partial(ms_text, form=".0f", unit="")
 _FILE_WIDTH = 120
 _ID = 8
-"""Characters of an id that are shown; `--trial` accepts the beginning of an id."""
+"""Number of characters of an id that are shown; `--trial` accepts the beginning of an id."""
 _KINDS = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
 _WHOLE_CORE = 0.95
 """A flight that had at least this share of a core counts as undisturbed."""
@@ -99,7 +99,7 @@ def print_result(result: CampaignResult, folder: Path) -> None:
 
 
 def _against(result: CampaignResult, onset: Onset) -> str:
-    """How far an onset is from what was computed, as far as anything was."""
+    """How far an onset is from its predicted value, in words, or that there is none."""
     if onset.difference is None:
         return "with no margin to compare it with"
     limit = "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
@@ -156,7 +156,7 @@ def print_reflown(reflown: Reflown) -> None:
 
 
 def _reason(reflown: Reflown) -> str | None:
-    """The reason of a trial's verdict as `gcs fly` tells it, from the summary of the flight that was judged."""
+    """The reason for a trial's verdict as `gcs fly` words it, from the summary of the flight that was judged."""
     outcome, flown = reflown.outcome, (read_summary(run / SUMMARY_FILE) for run in reflown.runs)
     judged = (outcome.reason, outcome.spacing_error_final_m)
     found = next((own for own in flown if (own.reason, own.spacing_error_final_m) == judged), None)
@@ -166,7 +166,7 @@ def _reason(reflown: Reflown) -> str | None:
 
 
 def checks_of(result: CampaignResult) -> list[Check]:
-    """One check that onset and margin agree, and one for every trial that could not be flown."""
+    """One check that onset and margin agree, and a failed one for every trial that could not be flown."""
     skipped = "" if result.failure or result.assert_onset is not None else "--assert-onset was not given"
     name = "the onset is where the margin says" if result.assert_onset is not None or skipped else "the sweep was flown"
     agrees = Check(name, failure=result.failure or "", skipped=skipped)
@@ -215,7 +215,7 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
 
 
 def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
-    """Print, for each rate, the largest formation that the links carry and the next one, which they do not."""
+    """Print for each rate the largest formation that the links carry and the smallest tried that they do not."""
     console = plain_console()
     loads = [load for capacity in found for load in (capacity.most, capacity.next) if load is not None]
     title = f"{scenario.name}: what its links carry"

@@ -1,4 +1,4 @@
-"""`gcs grade`, `view`, `export` and `recover`: what can be done with the folder of a run."""
+"""`gcs grade`, `view`, `export` and `recover`: commands that work on the folder of a run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def grade(run: RunFolder, as_json: AsJson = False) -> None:
     """Compare a flight's latencies with the truth log.
 
-    Shows the errors of the measured latencies, and those of the emulated link delays.
+    Shows the errors of the measured latencies and of the emulated link delays.
     """
     from gcs.runs.grade import grade as graded
 
@@ -37,7 +37,7 @@ def print_grade(result: "Grade") -> None:
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
     picture: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="write a picture instead of opening a window")
+        Path | None, typer.Option(metavar="FILE.png", help="write a picture to this file instead of opening a window")
     ] = None,
     web: Annotated[bool, typer.Option("--web", help="serve it to browsers on this machine until Ctrl-C")] = False,
     at: Annotated[

@@ -1,4 +1,4 @@
-"""`gcs scenarios`, `new`, `check`, `design` and `margin`: from a scenario to its gains and the delay they tolerate."""
+"""`gcs scenarios`, `new`, `check`, `design` and `margin`: scenarios, their gains, and the delay that these tolerate."""
 
 from functools import partial
 from math import inf
@@ -14,9 +14,9 @@ from gcs.errors import InputError
 from scenarios.networks import MOST_VEHICLES
 
 _LONGER = 1.01
-"""How many times the expected loop delay an effective one is that is worth a line."""
+"""Smallest ratio of effective to expected loop delay that is printed."""
 _RARE = 0.01
-"""Expected number of failsafes in a flight that is not worth a line."""
+"""Largest expected number of failsafes in a flight that is not printed."""
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def scenarios(
-    links: Annotated[bool, typer.Option("--links", help="list the link profiles that ship")] = False,
+    links: Annotated[bool, typer.Option("--links", help="list the shipped link profiles instead")] = False,
     as_json: options.AsJson = False,
 ) -> None:
-    """List the scenarios that ship; commands accept their names."""
+    """List the shipped scenarios; commands accept their names."""
     from scenarios.shipped import FOLDER, PROFILES, description, names
 
     folder = PROFILES if links else FOLDER
@@ -57,7 +57,7 @@ def new(
 ) -> None:
     """Write a scenario to start from, by default a chain of three.
 
-    Also writes scenario.schema.json beside it, with which editors complete and check the keys.
+    Also writes scenario.schema.json beside it, which lets editors complete and check the keys.
     """
     from scenarios import shipped
     from scenarios.errors import did_you_mean
@@ -111,14 +111,14 @@ def check(
     allow_code: options.AllowCode = False,
     assert_headroom: Annotated[
         float | None,
-        typer.Option(metavar="FRACTION", help="exit with code 1 if less headroom is to be expected over the links"),
+        typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom expected over the links is lower"),
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Check a scenario before a flight: its keys, design and start.
 
-    Exit code 2 if `gcs fly` would refuse it. --assert-headroom means the headroom that 99 % of the set-points keep, and
-    that of the constant loop delay which late and lost datagrams amount to.
+    Exit code 2 if `gcs fly` would refuse it. --assert-headroom tests two figures: the headroom that 99 % of the
+    set-points keep, and the headroom of the effective loop delay, which takes late and lost datagrams into account.
     """
     from gcs.drive import preflight
     from gcs.drive.check import check as checked
@@ -191,7 +191,7 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
 
 
 def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
-    """The loop delay that the links lead to, and what it leaves."""
+    """Lines on the loop delay expected over the links, and on the headroom it leaves."""
     from gcs.views.console import ms_text, number_text
 
     margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
@@ -290,7 +290,7 @@ def margin(
         Path,
         typer.Argument(
             metavar="MODEL.json|FILE.mat|SCENARIO.toml",
-            help="any linear loop with delays, or one sampled and held (docs/reference/margin.md), or a scenario",
+            help="a linear loop with delays, continuous or sampled and held (docs/reference/margin.md), or a scenario",
         ),
     ],
     allow_code: options.AllowCode = False,

@@ -1,6 +1,6 @@
 """`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin predicts.
 
-The work is in `gcs.stress`; what is printed is in `gcs.cli.results`.
+The work is done in `gcs.stress`; the output is in `gcs.cli.results`.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ def stress(
         str, typer.Option(metavar=_AXIS, help="link delay in s, up + down; --link-delay of gcs fly is each way")
     ] = "",
     delay_of: Annotated[
-        list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="the same of one vehicle; may be repeated")
+        list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="link delay of one vehicle; may be repeated")
     ] = None,
     jitter: Annotated[
         str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
@@ -46,20 +46,20 @@ def stress(
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     prediction: Annotated[
         str,
-        typer.Option(metavar="S,S", help="with two axes: a map for each of these assumed loop delays in s; 0 is off"),
+        typer.Option(metavar="S,S", help="with two axes: one map for each assumed loop delay in s; 0 is off"),
     ] = "",
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
     disturbance: Annotated[
-        bool, typer.Option("--disturbance", help="raise the worst disturbance of the errors instead; needs --onset")
+        bool, typer.Option("--disturbance", help="raise the worst disturbance, not the delay; needs --onset")
     ] = False,
     onset: Annotated[bool, typer.Option("--onset", help="find the delay at which the formation breaks")] = False,
     onset_of: Annotated[
         int | None,
-        typer.Option(metavar="ID", help="--onset, slowing the link of this vehicle alone, the others as they are"),
+        typer.Option(metavar="ID", help="like --onset, but slow only this vehicle's link; the others stay as they are"),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(metavar="FRACTION", help="how close to the onset the last flights are")
+        float, typer.Option(metavar="FRACTION", help="relative distance of the last flights from the onset")
     ] = 0.02,
     seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights at each point, each with its own seed")] = 1,
     workers: Annotated[
@@ -78,7 +78,7 @@ def stress(
         float | None,
         typer.Option(
             metavar="FRACTION",
-            help="exit with code 1 if onset and margin differ by more, or the error is larger; implies --onset",
+            help="exit with code 1 if onset and margin differ by more, or its error is larger; implies --onset",
         ),
     ] = None,
     allow_code: options.AllowCode = False,
@@ -89,15 +89,15 @@ def stress(
     """Raise the link delay until the formation breaks.
 
     --delay, --delay-of, --jitter, --loss and --rate take FROM:TO:N (N values, ends included) or a list (0.1,0.2,0.4).
-    One of them makes a sweep, two make a map; --prediction then draws a map for each assumed delay, side by side. The
+    One of them makes a sweep, two make a map; --prediction then draws one map for each assumed delay, side by side. The
     loop delay is the link delay plus the wait for the control tick. The measured onset is compared with the delay
-    margin. --onset gives all vehicles links of one delay; --onset-of finds how much more delay the link of one vehicle
-    takes, with all other links as in the scenario.
+    margin. --onset gives all vehicles' links the same delay; --onset-of finds how much more delay the link of one
+    vehicle can take, with all other links as in the scenario.
 
     With --disturbance and --onset, every vehicle is disturbed by w = D e, where e are the errors, at one link delay:
-    that of the scenario, or one --delay. The worst D is scaled up, and the onset compared with the stability radii.
+    the scenario's, or a single --delay. The worst D is scaled up, and its onset compared with the stability radii.
 
-    Simulated autopilots fly in virtual time, after they have shown their response, which the margin includes.
+    Simulated autopilots fly in virtual time. Their response is identified first, and the margin takes it into account.
 
     Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, or a trial flown again
     differs.
@@ -223,8 +223,8 @@ def _study(
     if scenario.control.prediction == "measured":
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         options.refuse(file, f"control.prediction: read 'measured', wanted {wanted}")
-    # a campaign does not fly the slower gains of the schedule, so they need not be designed
     options.refuse(file, bad_start(scenario))
+    # the calm monitor has no slower gains, which a campaign does not fly
     design, planned = flight_plan(scenario.with_calm_monitor())
     plan = identified_in_flight(planned)
     if plan is not planned:
@@ -234,7 +234,7 @@ def _study(
 
 
 def _say_how_long(study: "Study", axes: "list[Axis]", seeds: int, workers: int) -> None:
-    """Say how many flights a sweep has and how long they will take, by the speed of one second of such a flight."""
+    """Print how many flights a sweep has and how long they will take, from the speed of a flight of one second."""
     from gcs.stress.free_response import in_place
     from gcs.studies.benchmark import start_and_speed
 
@@ -256,7 +256,7 @@ def _disturb(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Find the disturbances that break the formation, at the link delay of the scenario or of --delay, and exit."""
+    """Find the disturbances that break the formation at the link delay of the scenario or of --delay, then exit."""
     from gcs.cli.results import print_disturbances
     from gcs.runs.record import write_whole
     from gcs.stress.axes import at_coordinates, parse_axis

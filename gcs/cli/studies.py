@@ -1,4 +1,4 @@
-"""`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.results`."""
+"""`gcs compare`, `identify`, `thesis`, `bench` and `capacity`; most of their output is in `gcs.cli.results`."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ _SLOWEST_HZ, _FASTEST_HZ = 1.0, 500.0
 def compare(
     scenario_file: options.ScenarioFile,
     out: options.OutFolder = None,
-    sizes: Annotated[bool, typer.Option(help="also time the designs of longer and longer chains")] = True,
+    sizes: Annotated[bool, typer.Option(help="also time designs for chains of growing length")] = True,
     as_json: options.AsJson = False,
 ) -> None:
     """Design and fly a scenario by every method, side by side.
@@ -51,7 +51,7 @@ def compare(
 def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode = False) -> None:
     """Find how the vehicles of a scenario respond to set-points.
 
-    They fly briefly in virtual time, and the answer is printed as the table [response] of a scenario.
+    The leader flies briefly in virtual time, and its response is printed as the table [response] of a scenario.
 
     For dynamics = "jsbsim" and dynamics in a Python file; autopilots are identified in flight.
     """
@@ -61,7 +61,7 @@ def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode 
 
 
 def thesis(out: options.OutFolder = None, as_json: options.AsJson = False) -> None:
-    """Reproduce the thesis: published beside computed figures."""
+    """Reproduce the thesis: published against computed figures."""
     from gcs.studies import thesis as source
     from gcs.views.console import progress
 
@@ -87,14 +87,14 @@ def bench(
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="number of flights; the fastest counts")] = 10,
     real_time: Annotated[
         bool,
-        typer.Option("--real-time", help="fly once over UDP; shows punctuality and the errors of measured latencies"),
+        typer.Option("--real-time", help="fly once over UDP; show punctuality and the errors of measured latencies"),
     ] = False,
-    signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
+    signed: Annotated[bool, typer.Option("--signed", help="also measure the cost of signing")] = False,
     peers: Annotated[
         bool, typer.Option("--peers", help="do the same work with other people's tools and print ratios")
     ] = False,
     cluster: Annotated[
-        int, typer.Option(metavar="TRIALS", min=0, show_default=False, help="fly a map of so many trials on Dask")
+        int, typer.Option(metavar="TRIALS", min=0, show_default=False, help="fly a map of this many trials on Dask")
     ] = 0,
     workers: Annotated[
         int,
@@ -107,11 +107,11 @@ def bench(
 ) -> None:
     """Measure how much faster than real time flights are computed.
 
-    Also measures how much of its control period the station needs, and compares a whole tick of it with what pymavlink
-    takes to parse the positions.
+    Also measures the share of its control period that the station needs, and compares the time of its whole tick with
+    the time that pymavlink takes to parse the positions.
 
-    With --peers, the same work is done by this station and by pymavlink, MAVSDK, JSBSim, python-control and solvers, as
-    far as they are installed. Formations of 5, 20 and 100 vehicles fly over UDP, or those of --vehicles.
+    With --peers, the same work is done by this station and by pymavlink, MAVSDK, JSBSim, python-control and solvers, if
+    they are installed. Formations of 5, 20 and 100 vehicles fly over UDP, or one of --vehicles.
 
     With --cluster, the map is flown twice on Dask: by one local worker and by all. Each trial flies for --seconds.
     """
@@ -153,9 +153,7 @@ def capacity(
     scenario_file: options.ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=MOST_VEHICLES, help="largest formation tried")] = 100,
-    seeds: Annotated[
-        int, typer.Option(metavar="N", min=1, help="flights of each formation, all of which must succeed")
-    ] = 3,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; all must succeed")] = 3,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="store flights in this new or empty folder")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="resume the study in --out")] = False,
     as_json: options.AsJson = False,

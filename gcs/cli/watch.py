@@ -1,4 +1,4 @@
-"""`gcs monitor` and `gcs replay`: latencies of live links and telemetry logs, without commanding anything."""
+"""`gcs monitor` and `gcs replay`: latencies of live links and telemetry logs, without commanding vehicles."""
 
 import sys
 from dataclasses import replace
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _TIMESYNC_HZ = _POSITION_HZ = 10.0
 SavedLinks = Annotated[
     Path | None,
-    typer.Option("--save-links", metavar="FILE.toml", help="write the links as a profile that scenarios can name"),
+    typer.Option("--save-links", metavar="FILE.toml", help="write the links as a profile for scenarios"),
 ]
 ComparedMargin = Annotated[
     float | None, typer.Option("--margin", metavar="SECONDS", help="compare with this delay margin", min=0.0)
@@ -34,7 +34,7 @@ def monitor(
     ] = None,
     listen: Annotated[
         str,
-        typer.Option("--listen", "--connect", metavar="HOST:PORT", help="address that vehicles or a mirror send to"),
+        typer.Option("--listen", "--connect", metavar="HOST:PORT", help="address to which vehicles or a mirror send"),
     ] = "127.0.0.1:14550",
     margin: ComparedMargin = None,
     design: Annotated[
@@ -42,7 +42,7 @@ def monitor(
     ] = None,
     key: options.KeyFile = None,
     request: Annotated[
-        bool, typer.Option("--request", help="ask vehicles that send no position for it, with SET_MESSAGE_INTERVAL")
+        bool, typer.Option("--request", help="ask vehicles that send no position to do so, with SET_MESSAGE_INTERVAL")
     ] = False,
     silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays may then be lower bounds")] = False,
     seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = float(
@@ -51,19 +51,19 @@ def monitor(
     save_links: SavedLinks = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Watch latencies against a margin, commanding nothing.
+    """Compare latencies with a margin, without commanding vehicles.
 
-    It watches the ports of all networks of SCENARIO; without one, a single port.
+    The monitor listens on the ports of all networks of SCENARIO; without one, on a single port.
 
-    The monitor sends only TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. It
-    sends no heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without
-    any exchange, delays are measured against the fastest frames, which makes them lower bounds.
+    It sends only TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. It sends no
+    heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without any
+    exchange, delays are measured against the fastest frames, which makes them lower bounds.
 
-    The loop delay is that of gcs fly, over all phases of its control tick. Without SCENARIO the rates are unknown: then
-    the time for which a position is repeated counts as well.
+    The loop delay is the one that gcs fly would have, over all phases of its control tick. Without SCENARIO the rates
+    are unknown, and the loop delay also includes the time for which a position is repeated.
 
-    An ArduPilot sends no position until it is asked. --request asks each vehicle for LOCAL_POSITION_NED, at the
-    telemetry rate of the scenario or 10 a second; a vehicle that obeys another station may refuse.
+    An ArduPilot sends no position until asked. --request asks each vehicle for LOCAL_POSITION_NED, at the telemetry
+    rate of the scenario or 10 a second; a vehicle that obeys another station may refuse.
 
     Exit code 1 if an expected vehicle was never heard, if none was heard, or if a loop delay (p99) exceeded the margin.
     """
@@ -72,7 +72,7 @@ def monitor(
     given, margin_of = _given(margin, design)
     if save_links is not None:
         options.out_file("--save-links", save_links)
-    if sys.stdout.isatty():  # a closed one sends a signal; a reader that closes its pipe must still end the command
+    if sys.stdout.isatty():  # a closed terminal sends a signal; a reader that closes its pipe must end the command
         outlive_readers()
     scenario = None if scenario_file is None else _formation(scenario_file, given)
     networks = [0] if scenario is None else networks_of(vehicle.system_id for vehicle in scenario.vehicles)
@@ -81,7 +81,7 @@ def monitor(
             from gcs.plan.planner import flight_plan, over_own_links
 
             given, margin_of = over_own_links(*flight_plan(scenario))[0], f"of {scenario.name}'s gains"
-        # Imported after the socket is open: datagrams that arrive during the imports keep their receive stamps.
+        # Imported after the socket is open: datagrams that arrive during the imports keep their receive timestamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
         from gcs.watch.live import watch_links
@@ -135,8 +135,8 @@ def replay(
 
     Round trips come from the TIMESYNC exchanges in the log. Without them, delays are measured against the fastest
     frames, which makes them lower bounds. Spacing errors need the formation, from the run's folder or from SCENARIO.
-    Formations of several networks are refused, as a log does not name its network. Damaged parts of the log are left
-    out and counted.
+    Formations of several networks are refused, because a log does not name its network. Damaged parts of the log are
+    skipped and counted.
     """
     given, _ = _given(margin, design)
     from gcs.watch.rebuild_report import found, rebuild_report
@@ -166,7 +166,7 @@ def replay(
 
 
 def _formation(scenario_file: Path, given: "Design | None") -> "Scenario":
-    """The scenario; of one whose margin is given no code is run, as the formation is all that is needed of it."""
+    """The scenario. If the margin is given, its code is not run, because only its formation is needed."""
     code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
     return options.load_scenario(scenario_file, allow_code=code_allowed)
 
@@ -199,7 +199,7 @@ def _print_rebuilt(report: "RebuildReport") -> None:
 
 
 def _given(margin: float | None, design: Path | None) -> "tuple[Design | None, str]":
-    """The design of --design, or one that has only the margin of --margin; and the source of the margin in words."""
+    """The design of --design, or one with only the margin of --margin, and the source of the margin in words."""
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
     if margin is None and design is None:

@@ -1,7 +1,7 @@
-"""α and the growth of spacing errors at a loop delay: that expected of a scenario's links, or one measured in flight.
+"""α and the growth of spacing errors at a loop delay: the one expected over a scenario's links, or one measured.
 
-A design's figures without delay say little about a flight; `gains.performance.flown` has those at a loop delay. Gains
-on a pattern other than a leader-follower tree have an α only: errors run both ways, so that no growth from vehicle to
+A design's figures without delay say little about a flight; `gains.performance.flown` computes those at a loop delay.
+Gains on a pattern other than a leader-follower tree have only an α: errors run both ways, and no growth from vehicle to
 vehicle is defined.
 """
 
@@ -35,7 +35,7 @@ def with_figures_at_delay(design: Design, plan: FlightPlan) -> Design:
         flown, chains = _flown(design, scenario)
         requirement = design.requirement
         peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
-        # where vehicles differ, the least counts
+        # if vehicles differ, the smallest value counts
         alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
         figures |= {
             "alpha_kept": alpha,
@@ -62,12 +62,12 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 
 def _is_predicted(design: Design) -> bool:
-    """Whether more than the newest states is fed back: a loop of `gains.criteria.predicted`."""
+    """Whether the loop predicts or feeds forward, which makes it one of `gains.criteria.predicted`."""
     return design.prediction is not None or design.feed_forward > 0.0
 
 
 def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDelay:
-    """The figures of a loop with prediction or feed-forward; known for inclusion gains only."""
+    """The figures of a loop with prediction or feed-forward; known only for inclusion gains on the ground."""
     assumed_s = 0.0
     if design.prediction is not None:
         fixed_s = design.prediction.assumed_delay_s
@@ -97,7 +97,7 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
 
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
-    """The formations flown, empty where no α is defined, and the loops of followers in a leader-follower tree."""
+    """The formations flown, none where no α is defined, and the loops of followers in a leader-follower tree."""
     if design.vehicles < 2 or design.margin_unknown or _is_predicted(design):
         return [], []
     entry = _gain_set(design, gain_set)
@@ -123,7 +123,7 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
 
 
 def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
-    """The formation with the gains of an entry of a graph design's schedule."""
+    """The formation with the gains of one entry of a graph design's schedule."""
     formation = plan_formation(scenario)
     model, first = formation.model, np.array(design.K)
     if design.loop == "onboard":

@@ -1,11 +1,11 @@
 """The planned motion of a manoeuvring formation: place, velocity and acceleration of each vehicle over time.
 
-With the nominal velocity v_d(t) of heading psi(t), and places b_k(t) relative to the leader that change with formation
-changes, vehicle k is to fly
+The nominal velocity v_d(t) has the heading psi(t), and formation changes move the places b_k(t) relative to the leader.
+Vehicle k is to fly
 
     r_k = integral of v_d + R b_k,    R = 1 with fixed offsets, the rotation by psi with offsets in the heading frame.
 
-`PlannedMotion` gives R b_k and its derivatives, and those of r_k. A flight has one if it manoeuvres, else none.
+`PlannedMotion` gives R b_k and its derivatives, and those of r_k. Only a flight that manoeuvres has one.
 """
 
 from bisect import bisect_right
@@ -23,7 +23,7 @@ from scenarios.smooth import smooth_step
 
 Vector = tuple[float, float]
 _MOMENTS = 200
-"""Instants in each change at which planned motions are evaluated."""
+"""Number of intervals into which each change is divided to evaluate planned motions."""
 
 
 class Reference(NamedTuple):
@@ -54,9 +54,9 @@ class _Span(NamedTuple):
 
 
 class PlannedMotion:
-    """The motion that a scenario asks of its vehicles, rows in the order of the formation.
+    """The motion that a scenario asks of its vehicles; rows are in the order of the formation.
 
-    If somebody else flies the leader, velocities are relative to the leader's.
+    If the leader is flown externally, velocities are relative to the leader's.
     """
 
     def __init__(self, scenario: Scenario, formation: Formation) -> None:
@@ -108,7 +108,7 @@ class PlannedMotion:
         return [(span.from_s, _array(span.before), _array(span.after)) for span in self._spans[1:]]
 
     def largest(self, row: int) -> Largest:
-        """The extremes at the start and at many instants of every change; in between the motion is steady."""
+        """The extremes at the start and over every change, sampled densely; between changes the motion is steady."""
         changes = [(span.from_s, span.duration_s) for span in self._spans[1:]]
         if self._course is not None:
             changes += [(change.from_s, change.duration_s) for change in self._course.changes]
@@ -128,7 +128,7 @@ def _array(places: list[complex]) -> FloatArray:
 
 
 def _spans(scenario: Scenario, formation: Formation) -> Iterator[_Span]:
-    """The places from the start on, then those around each formation change."""
+    """The places at the start, then those before and after each formation change."""
     offsets = {v.system_id: complex(*(v.offset_ne_m or (0.0, 0.0))) for v in scenario.vehicles}
 
     def places() -> list[complex]:
@@ -155,9 +155,9 @@ class Nearest(NamedTuple):
 
 
 def nearest_planned(scenario: Scenario) -> Nearest | None:
-    """The least distance between any two vehicles in their places, over the whole flight, altitudes included.
+    """The least distance between the planned places of any two vehicles over the whole flight, altitudes included.
 
-    None for a single vehicle. During a change two places move along a line relative to each other, and all places turn
+    None for a single vehicle. During a change, two places move along a line relative to each other, and all places turn
     together, so the least distance has a closed form.
     """
     formation = plan_formation(scenario)
@@ -181,7 +181,7 @@ def nearest_planned(scenario: Scenario) -> Nearest | None:
 
 
 def _time_of(share: float) -> float:
-    """The x at which `smooth_step` has done a share of its way, by bisection."""
+    """The x at which `smooth_step` reaches a share of its rise, by bisection."""
     low, high = 0.0, 1.0
     for _ in range(40):
         middle = (low + high) / 2.0

@@ -1,4 +1,4 @@
-"""What the design of a scenario reaches for every criterion."""
+"""The value that a scenario's design reaches for every criterion."""
 
 from math import inf
 
@@ -17,15 +17,15 @@ from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
 _QUICK_STATES = 12
-"""Most states of one axis for which the criteria are computed before a flight: with more they take too long."""
+"""Maximum number of states per axis for which criteria are computed before a flight; with more they take too long."""
 
 
 def with_criteria(design: Design, scenario: Scenario, *, most_states: float = _QUICK_STATES) -> Design:
-    """The design with `criteria`, except those that take long; without any if it predicts or is unstable."""
+    """The design with `criteria`, except those that take long; unchanged if it predicts or is unstable."""
     try:
         found = _found(design, scenario, most_states)
     except BadModelError:
-        # gains so large that the delay spans too many turns of the loop
+        # the gains are so large that the delay spans too many cycles of the loop
         return design
     return design if found is None else design.model_copy(update={"criteria": found})
 
@@ -47,7 +47,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
 
 
 def with_bounds(design: Design, scenario: Scenario) -> Design:
-    """The design with the criteria that take long: the bound on α of any controller, and varying delays."""
+    """The design with the criteria that take long to compute: the bound on α for any controller, and varying delays."""
     design = with_criteria(design, scenario, most_states=inf) if design.criteria is None else design
     figures, found = _figures(design, scenario), design.criteria
     if figures is None or found is None or design.loop == "onboard":
@@ -55,7 +55,7 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
     more: dict[str, object] = {}
     period_s, keys = figures.timing.period_s, scenario.control.criteria
     if figures.weight is None and figures.responses is None and not figures.discrete:
-        # a vehicle in front that does not hear the one behind: the bound of the follower alone holds for both
+        # if the vehicle in front does not hear the one behind, the bound for the follower alone holds for both
         tree = design.inclusion_gains is not None
         keep = slice(1, None) if tree else slice(None)
         A, B = figures.model.A[keep, keep], figures.model.B[keep, keep]
@@ -71,9 +71,9 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
 
 
 def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> dict[str, object]:
-    """Which bound proves stability for all delays from `low_s` to `high_s`, and up to which delay.
+    """Names the bound that proves stability for all delays from `low_s` to `high_s`, and the delay up to which it does.
 
-    On patterns only the bound for a spread is tried: the matrix inequalities of the others take minutes there.
+    On patterns only the bound for a spread is tried: the matrix inequalities of the others take minutes.
     """
     hold_s, middle_s, spread_s = figures.timing.period_s / 2.0, (low_s + high_s) / 2.0, (high_s - low_s) / 2.0
     if figures.model.vehicles > 2 and rate > 0.0:
@@ -89,7 +89,7 @@ def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> di
 
 
 def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
-    """The figures of a design's fastest gains, of one axis; None where the loop that flies is another one."""
+    """The figures of a design's fastest gains on one axis; None if the loop as flown is not of this kind."""
     if design.prediction is not None or design.feed_forward or design.vehicles < 2 or design.margin_unknown:
         return None
     known = [own.response for own in design.response.vehicles] if design.response else []

@@ -1,4 +1,4 @@
-"""The design of a scenario's loop, from the gains to design.json, the plan and the tables.
+"""The record of a design: gains, margins and figures, for design.json, the flight plan and the printed tables.
 
 `gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
 """
@@ -20,7 +20,7 @@ Matrix = tuple[tuple[float, ...], ...]
 
 
 Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(plain)]
-"""A delay margin in s; None where no delay makes the loop unstable, or where it is not known."""
+"""A delay margin in s; None if no delay makes the loop unstable, or if it is unknown."""
 
 
 class BlockMargin(Published):
@@ -38,7 +38,7 @@ class TradeOffPoint(Published):
 
 
 class Behaviour(Published):
-    """As in `gains.performance.behaviour.Behaviour`; None for what is not finite."""
+    """The fields of `gains.performance.behaviour.Behaviour`; None for values that are not finite."""
 
     decay_rate_1_s: float
     damping: float | None
@@ -50,10 +50,10 @@ class Behaviour(Published):
 
 
 class Proof(Published):
-    """P of the Lyapunov function, what it proves, and the eigenvalues that were checked.
+    """P of the Lyapunov function, the α that it proves, and the eigenvalues that were checked.
 
-    Inclusion gains have the proof of `gains.performance.robust.Certificate`, gains on a pattern that of
-    `gains.design.dk_iteration.DecayProof`.
+    The proof is `gains.performance.robust.Certificate` for inclusion gains, and `gains.design.dk_iteration.DecayProof`
+    for gains on a pattern.
     """
 
     P: Matrix
@@ -64,7 +64,7 @@ class Proof(Published):
 
 
 class GainSet(Published):
-    """One entry of the gain schedule: its gains, or the share of the stream it flies with, and its figures."""
+    """One entry of the gain schedule: its gains, or its share of the streamed command, and its figures."""
 
     streamed_share: float = 1.0
     time_scale: float = 1.0
@@ -89,7 +89,7 @@ class VehicleResponse(Published):
     natural_frequency_rad_s: float | None = None
     damping: float | None = None
     misfit: float | None = None
-    """The share of the velocity (rms) in the manoeuvre that the response leaves unexplained; None if it was given."""
+    """Share of the velocity (rms) in the manoeuvre that the response does not explain; None for a given response."""
 
     @property
     def response(self) -> Response:
@@ -97,7 +97,7 @@ class VehicleResponse(Published):
 
 
 class ResponsePart(Published):
-    """How the vehicles respond to set-points, and what the margin would be if they did so at once."""
+    """How the vehicles respond to set-points, and the margin of the same gains if they responded at once."""
 
     source: str
     model: str = ""
@@ -117,53 +117,53 @@ class OnboardPart(Published):
 
 
 class WindowAt(Published):
-    """The loop delays (s) between which a predicted loop is stable; None where no longer delay is too long."""
+    """Range of loop delays (s) in which a predicted loop is stable; the upper end is None if no delay is too long."""
 
     assumed_delay_s: float
     mismatch_window_s: tuple[float, Margin]
     mismatch_window_continuous_s: tuple[float, Margin]
     jump_s: float | None = None
-    """How early or late set-points may act, jumping, if the age of telemetry does not vary; None where not proved."""
+    """How early or late set-points may act, varying in any way, at a constant age of telemetry; None if not proved."""
 
 
 class PredictionPart(Published):
     """The mismatch window of the fastest gains, and the same at other assumed delays."""
 
     assumed_delay_s: float | None = None
-    """None where the measured delay is assumed; then there is no one window."""
+    """None if the station assumes the measured delay; there is then no single window."""
     mismatch_window_s: tuple[float, Margin] | None = None
     mismatch_window_continuous_s: tuple[float, Margin] | None = None
     jump_s: float | None = None
     windows: tuple[WindowAt, ...] = ()
     assumes: str = ""
-    """What is assumed of the set-points sent."""
+    """What the prediction assumes about the set-points sent."""
 
 
 class FiguresAtDelay(Published):
-    """α and the growth of spacing errors at a loop delay; None where unknown or without bound."""
+    """α and the growth of spacing errors at a loop delay; None where unknown or unbounded."""
 
     loop_delay_s: float | None
     alpha: float | None = None
     has_string_verdict: bool = True
-    """Whether errors run down chains of equal followers, without which there is no string peak."""
+    """Whether the formation has chains of identical followers; otherwise no string peak is defined."""
     string_peak: float | None = None
 
 
 class FiguresAtExpectedDelay(FiguresAtDelay):
-    """The figures at the loop delay of the scenario's links, and the delays up to which they stay above a limit."""
+    """The figures at the loop delay of the scenario's links, and the delays up to which they keep a limit."""
 
     alpha_kept: float | None = None
-    """None with prediction or feed-forward, where the delays are not computed."""
+    """None with prediction or feed-forward, for which these delays are not computed."""
     alpha_kept_to_s: float | None = None
-    """None where α is kept at every loop delay; the same below."""
+    """None if α is kept at every loop delay; the same for `string_peak_kept_to_s`."""
     string_peak_kept: float | None = None
     string_peak_kept_to_s: float | None = None
     delays_differ: bool = False
-    """Whether only the slowest vehicle has this loop delay; the figures are those if all have it."""
+    """Whether only the slowest vehicle has this loop delay. The figures are computed as if all vehicles had it."""
 
 
 class VehicleSpread(Published):
-    """The root mean square of one follower's spacing error: the true one, and the one that is reported."""
+    """The root mean square of one follower's true spacing error, and of its reported one."""
 
     system_id: int
     spacing_error_rms_m: float
@@ -171,7 +171,7 @@ class VehicleSpread(Published):
 
 
 class PredictedSpread(Published):
-    """How far disturbances and errors of navigation spread the spacing errors at a loop delay, in the long run."""
+    """The steady-state spread of spacing errors at a loop delay, from disturbances and navigation errors."""
 
     loop_delay_s: float
     decay_rate_1_s: float
@@ -179,7 +179,7 @@ class PredictedSpread(Published):
 
 
 class WholeFigures(Published):
-    """α for disturbances of the whole formation together, where that of the design is one follower's."""
+    """α for disturbances of the whole formation at once, where the design's own α is for one follower."""
 
     alpha: float
     loop_delay_s: float
@@ -187,10 +187,10 @@ class WholeFigures(Published):
 
 
 class CriteriaPart(Published):
-    """What a design reaches of everything it can be asked for, asked or not; None where it is not defined."""
+    """The values that a design reaches for all criteria, requested or not; None where one is not defined."""
 
     at_delay_s: float
-    """Loop delay of the figures at a delay: the one asked for, or that of the scenario's links."""
+    """Loop delay of the figures at a delay: the requested one, or that of the scenario's links."""
     damping: float
     natural_frequency_rad_s: float
     alpha_at_delay: float
@@ -199,9 +199,9 @@ class CriteriaPart(Published):
     noise_gain: float | None
     weight: tuple[float, float] = (1.0, 1.0)
     alpha_bound: float | None = None
-    """α that no controller exceeds at the delay. Only `gcs design` computes this and the fields below."""
+    """Upper bound of α for any controller at the delay. Only `gcs design` computes this and the fields below."""
     delays_jumping_s: tuple[float, float] | None = None
-    """Around `at_delay_s`: the loop delay may jump between these delays in any way."""
+    """Range around `at_delay_s` in which the loop delay may jump in any way."""
     delays_covered_by: str | None = None
     delays_covered_to_s: float | None = None
 
@@ -214,30 +214,30 @@ class CodeRecord(Published):
 
 
 class GainsAtDelay(Published):
-    """Gains at loop delays, with prediction or without, and their figures there; only what is known is set.
+    """Gains at a loop delay, with or without prediction, and their figures there; only known fields are set.
 
-    A candidate for a measured link, a point of a front, or a way of a comparison with and without prediction.
+    A candidate for a measured link, a point of a front, or one side of a comparison with and without prediction.
     """
 
     method: Literal["inclusion", "graph-lqr"] = "inclusion"
     prediction: bool
     maximised: str = ""
     gains: Literal["fastest", "least", "own"] = "own"
-    """`fastest` at the delay, `least` that decay as fast with prediction, or the scenario's `own`."""
+    """The `fastest` at the delay, the `least` that decay as fast with prediction, or the scenario's `own`."""
     refused: str = ""
-    """Why there are none; then the figures are unknown."""
+    """Why there are no gains; the figures are then unknown."""
     K1: float | None = None
     K2: float | None = None
     K3: float | None = None
     tolerated: float | None = None
     loop_delay_s: float = nan
     ratio: float | None = None
-    """Of the delay to the longest without prediction."""
+    """Ratio of the delay to the longest one without prediction."""
     alpha: float | None = None
     alpha_design: float | None = None
     decay_rate_1_s: float | None = None
     decay_rate_half_way_1_s: float | None = None
-    """At the worse of the delays half-way to the ends of what is tolerated."""
+    """Decay at the worse of the two delays half-way to the ends of the tolerated range."""
     string_peak: float | None = None
     spacing_gain_s2: float | None = None
     noise_gain: float | None = None
@@ -248,7 +248,7 @@ class GainsAtDelay(Published):
 
 
 class LinkPart(Published):
-    """The loop delays over measured links and, once gains are chosen for them, why these."""
+    """The loop delays over measured links and, once gains are chosen for them, the reason for the choice."""
 
     source: str
     vehicles: tuple[int, ...]
@@ -262,7 +262,7 @@ class LinkPart(Published):
 
 
 class OwnMargins(Published):
-    """What the loop delay of one vehicle may be with each gain set; None without a limit."""
+    """The delay margins of one vehicle's own loop delay, one for each gain set; None without a limit."""
 
     system_id: int
     delay_margins_s: tuple[Margin, ...]
@@ -271,7 +271,7 @@ class OwnMargins(Published):
 class Design(Published):
     """The gains of a scenario, their margins and other figures, and the proofs; fields as published in design.json.
 
-    Only the sampled margin is required: what a method does not give, and what an older file lacks, keeps its default
+    Only the sampled margin is required. A field that a method does not give or an older file lacks keeps its default
     and is not written. The first margin of the schedule is that of the design.
     """
 
@@ -286,10 +286,10 @@ class Design(Published):
     delay_margin_s: Margin
     delay_margin_continuous_s: Margin = None
     margin_over_links: bool = False
-    """Whether the sampled margin is that over the scenario's links, as vehicles share a loop and their loop delays
-    differ; the continuous one never is."""
+    """Whether the sampled margin is the one over the scenario's links, because vehicles share a loop with different
+    loop delays. The continuous margin never is."""
     own_margins: tuple[OwnMargins, ...] = ()
-    """Of the vehicles that are not judged by the margins of the schedule."""
+    """Margins of the vehicles to which those of the schedule do not apply."""
     period_s: float = 0.0
     vehicles: int = 0
     leader: BlockMargin | None = None
@@ -312,17 +312,17 @@ class Design(Published):
     prediction: PredictionPart | None = None
     at_loop_delay: FiguresAtExpectedDelay | None = None
     whole: WholeFigures | None = None
-    """Only `gcs design` computes this and the spread."""
+    """Only `gcs design` computes this and `spread`."""
     spread: PredictedSpread | None = None
     criteria: CriteriaPart | None = None
     margin_unknown: str = ""
-    """Why no delay margin could be computed, which is then None; empty if one was."""
+    """Why no delay margin could be computed; the margins are then None. Empty if they are known."""
     code: tuple[CodeRecord, ...] = ()
     for_link: LinkPart | None = None
 
     @property
     def inclusion_gains(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """K1, K2 and K3 of a design by inclusion, (2, 2) each; None of one on a pattern."""
+        """K1, K2 and K3 of a design by inclusion, (2, 2) each; None for a design on a pattern."""
         if self.K1_1_s is None or self.K2_1_s is None or self.K3_1_s2 is None:
             return None
         return np.array(self.K1_1_s), np.array(self.K2_1_s), np.array(self.K3_1_s2)
@@ -334,7 +334,7 @@ class Design(Published):
 
     @property
     def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule; infinite where there is none, NaN where it is unknown."""
+        """The delay margins of the gain schedule; infinite where there is no limit, NaN where it is unknown."""
         every = [entry.delay_margin_s for entry in self.schedule] or [self.delay_margin_s]
         if self.margin_unknown:
             return (nan,) * len(every)
@@ -346,7 +346,7 @@ class Design(Published):
         return own.get(system_id, self.delay_margin_s)
 
     def with_schedule(self, schedule: tuple[GainSet, ...], **parts: Published | str) -> Self:
-        """The design with another schedule, of which the first entry gives its margins, and with other parts."""
+        """The design with another schedule, whose first entry gives the design's margins, and with other parts."""
         first = schedule[0]
         margins = {"delay_margin_s": first.delay_margin_s, "delay_margin_continuous_s": first.delay_margin_continuous_s}
         return self.model_copy(update=margins | {"schedule": schedule} | parts)

@@ -1,10 +1,10 @@
-"""How far a scenario's gusts, wind and errors of navigation spread the spacing errors, computed for a loop delay.
+"""The spread of spacing errors that a scenario's gusts, wind and navigation errors cause at a loop delay.
 
-Exact for a station that closes every loop with one rate (`gains.performance.disturbed`), with the fastest gains and
-links of one constant delay. Where clocks differ the station interpolates the state of the vehicle in front between two
-reports, which averages white noise. How much is known only after the flight: before it, all vehicles are taken to
-sample at one instant, and the errors reported may be up to 13 % smaller. Not computed for the loop on board, nor for a
-disturbance that depends on the errors (a sector).
+It is exact for a station that closes every loop at one rate (`gains.performance.disturbed`), with the fastest gains and
+links of one constant delay. If clocks differ, the station interpolates the state of the vehicle in front between two
+reports, which averages white noise. By how much is known only after the flight. Before it, all vehicles are assumed to
+sample at the same time, and the errors reported in flight may be up to 13 % smaller. The spread is not computed for the
+loop on board, nor for a disturbance that depends on the errors (a sector).
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from gcs.plan.formation import Formation, on_one_axis, plan_formation
 from scenarios.schema import Scenario
 
 _MOST_WHOLE = 50
-"""Largest formation whose α is computed: the work grows with the fourth power of the vehicles, 100 take 40 s."""
+"""Largest formation whose α is computed: the work grows with the fourth power of the size; 100 vehicles take 40 s."""
 
 
 def with_spread(design: Design, plan: FlightPlan) -> Design:
@@ -39,7 +39,7 @@ def with_spread(design: Design, plan: FlightPlan) -> Design:
 def predicted_spread(
     design: Design, scenario: Scenario, delay_s: float | FloatArray | None, older: FloatArray | None = None
 ) -> PredictedSpread | None:
-    """The rms of each follower's spacing error; None if nothing disturbs them, or it is not known.
+    """The rms of each follower's spacing error; None if nothing disturbs the formation, or if it is unknown.
 
     `delay_s` and `older` are those of `gains.performance.disturbed.DisturbedFormation`.
     """
@@ -72,7 +72,7 @@ def predicted_spread(
 def disturbed_formation(
     design: Design, scenario: Scenario, formation: Formation, delay_s: float | FloatArray
 ) -> DisturbedFormation | None:
-    """The loop of a design at a loop delay (s), that of all vehicles or of each, with what disturbs it."""
+    """The loop of a design and its disturbances, at one loop delay (s) for all vehicles or one for each."""
     air, navigation, rates, control = scenario.disturbance, scenario.navigation, scenario.rates, scenario.control
     K = _gain(design, formation.model)
     if (air is None and navigation is None) or K is None or control.loop == "onboard":

@@ -1,11 +1,11 @@
-"""The loop delay that a scenario's links lead to, before it is flown.
+"""The loop delay to be expected over a scenario's links, before it is flown.
 
-On links that only delay it is a sum. Jitter needs more than its mean: no delay is negative, a datagram that must not
-overtake waits for the one before it, and a state that arrives after a newer one is not used. Datagrams are therefore
-drawn as the links would carry them, with a seed of their own, and the median is taken, which flights report as p50 of
-the slowest vehicle. Where datagrams may overtake each other and jitter is as large as the delay, flights were up to 8 %
-faster than this. The median says nothing of datagrams that are lost or very late; what they amount to is
-`effective_loop_delays_s`.
+On links with only a constant delay it is a sum. With jitter the mean is not enough: no delay is negative, a datagram
+that must not overtake waits for the one before it, and a state that arrives after a newer one is not used. Datagrams
+are therefore drawn as the links would carry them, with their own seed, and the median is taken, which flights report
+as p50 of the slowest vehicle. If datagrams may overtake each other and jitter is as large as the delay, flights were up
+to 8 % faster than this. The median says nothing about datagrams that are lost or very late; `effective_loop_delays_s`
+takes them into account.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -27,19 +27,19 @@ from scenarios.schema import NS_PER_S, Scenario
 _SECONDS = 1000.0
 """Longest time over which datagrams are drawn."""
 _MOST = 20_000
-"""Most datagrams drawn in one direction."""
+"""Maximum number of datagrams drawn in one direction."""
 _PHASES, _DRAWS = 25, 200
-"""Phases of the ticks that are looked at; draws of the phases at which several vehicles report."""
+"""Number of tick phases that are evaluated, and of draws of the phases at which several vehicles report."""
 _SAME_S, _NEVER = 1e-9, 1e-12
-"""Instants (s) closer than this are one, and a probability this small stands for none."""
+"""Times (s) closer than this are equal, and a probability this small stands for zero."""
 _Way = tuple[tuple[Link, ...], Link]
-"""The links up of the states that a vehicle's commands need, and its link down."""
+"""The up links of the states that a vehicle's commands need, and its down link."""
 
 
 class DrawnDelays(NamedTuple):
     """Delays at random ticks: the ages of states (s) and the one-way delays of set-points (s).
 
-    Each is (phases, k): in a flight, the phase of the ticks to the telemetry stays about the same.
+    Each is (phases, k): during a flight, the phase between ticks and telemetry stays about the same.
     """
 
     ages_s: FloatArray
@@ -56,12 +56,12 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
 
 
 def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
-    """The expected loop delays (s) of a plan's vehicles: with the loop on board, of the states that commands need."""
+    """The expected loop delays (s) of a plan's vehicles; on board, they count from the states that commands need."""
     return expected_loop_delays_s(plan.scenario, _heard(plan))
 
 
 def _heard(plan: FlightPlan) -> dict[int, set[int]]:
-    """With the loop on board the vehicles whose states each streamed command needs: a spacing error has two ends."""
+    """The vehicles whose states each streamed command needs, two for a spacing error; empty for the ground loop."""
     if plan.scenario.control.loop == "ground":
         return {}
     model, ids = plan.model, plan.formation.system_ids
@@ -81,11 +81,11 @@ def expected_loop_delays_s(
 ) -> dict[int, float]:
     """The expected loop delay (s) of each vehicle by its system id, at the slowest delay points of its links.
 
-    On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
-    first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
-    happen to be. With jitter or losses it is the median over drawn datagrams, averaged over the phases. Where `heard`
-    names others for a vehicle, it counts from the oldest of their states in place of its own. The time that datagrams
-    wait for a channel is not included (`waits_for_channels`).
+    On links with only a constant delay, it is the delay up and down plus half the shorter period of telemetry and
+    control: the first command computed from a state waits between zero and a whole period, depending on the phases of
+    vehicle and station. With jitter or losses it is the median over drawn datagrams, averaged over the phases. If
+    `heard` names other vehicles for a vehicle, it counts from the oldest of their states instead of its own. The time
+    that datagrams wait for a channel is not included (`waits_for_channels`).
     """
     ways = _ways(scenario, heard)
     unlike = dict.fromkeys(ways.values())
@@ -104,20 +104,20 @@ def expected_loop_delays_s(
 
 
 def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
-    """Delays drawn over the links of each of a plan's vehicles, of which `planned_loop_delays_s` has the medians."""
+    """Delays drawn over the links of each of a plan's vehicles; `planned_loop_delays_s` has their medians."""
     ways = _ways(plan.scenario, _heard(plan))
     drawn = _drawn(plan.scenario, dict.fromkeys(ways.values()))
     return {own: drawn[way] for own, way in ways.items()}
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
-    """Loop delays (s) drawn over one vehicle's links, at random ticks (k,), as `expected_loop_delay_s` draws them."""
+    """Loop delays (s) at random ticks (k,), drawn over one vehicle's links as `expected_loop_delay_s` draws them."""
     way = (up,), down
     return _drawn(scenario, [way])[way].loop_s.ravel()
 
 
 def _ways(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int, _Way]:
-    """The links up whose states count for each vehicle, and its link down."""
+    """For each vehicle the up links of the states that its commands need, and its down link."""
     links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
     states_of = {own: sorted(heard.get(own) or [own]) for own in links}
     return {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
@@ -131,11 +131,11 @@ def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays
 
 
 def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
-    """The constant loop delays (s) that those of a plan's vehicles amount to.
+    """The effective loop delays (s) of a plan's vehicles: the equivalent constant ones.
 
-    They are the expected ones but for random links: where a datagram is late or lost, the command before it acts on
-    (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to nothing arrives. A prediction knows the
-    age of each state, whatever was lost, so only what set-points are late on average counts.
+    They differ from the expected delays only on random links. There, if a datagram is late or lost, the previous
+    command stays in force (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to nothing arrives.
+    A prediction knows the age of each state, whatever was lost, so only the mean delay of set-points counts.
     """
     scenario, ways, expected_s = plan.scenario, _ways(plan.scenario, _heard(plan)), planned_loop_delays_s(plan)
     rng, found = np.random.default_rng(0), dict[_Way, float]()
@@ -174,9 +174,9 @@ def _effective_s(
 
 
 def setpoint_gaps(scenario: Scenario) -> float:
-    """How often in a flight, over all vehicles, no set-point is expected to arrive for `safety.setpoint_timeout_s`.
+    """Expected number of times in a flight, over all vehicles, that set-points stop for `safety.setpoint_timeout_s`.
 
-    Each vehicle then enters failsafe. Outages of links are not included, nor is bandwidth.
+    The vehicle then enters failsafe. Neither outages of links nor bandwidth are included.
     """
     rng, often = np.random.default_rng(0), dict[Link, float]()
     downs = [scenario.link_of(vehicle.system_id)[1] for vehicle in scenario.vehicles]
@@ -189,7 +189,7 @@ def setpoint_gaps(scenario: Scenario) -> float:
 
 
 def _set_points(scenario: Scenario, down: Link, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """When each set-point is sent (s), and its one-way delay (s): infinite if it is lost."""
+    """The time at which each set-point is sent (s), and its one-way delay (s): infinite if it is lost."""
     enters, out, main = _stream(down, scenario.rates.control_hz, scenario, rng)
     late_s = (out - enters)[main > 0.0]
     if scenario.control.execute_at and np.isfinite(late_s).any():
@@ -211,9 +211,9 @@ def waits_for_channels(scenario: Scenario) -> bool:
 def _stream(
     link: Link, rate_hz: float, scenario: Scenario, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Datagrams of a link in order: when each enters, when it comes out, and 1.0 for those at `rate_hz`.
+    """Datagrams of a link in the order sent: when each enters, when it leaves, and 1.0 for those at `rate_hz`.
 
-    The others are TIMESYNC exchanges. A lost datagram never comes out; it delays nobody.
+    The others are TIMESYNC exchanges. A lost datagram never leaves, and delays no other.
     """
     span_s = min(_SECONDS, _MOST / rate_hz)
     often = np.arange(0.0, span_s, 1.0 / rate_hz)
@@ -232,14 +232,14 @@ def _stream(
 
 
 def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
-    """One-way delays of the set-points that come out."""
+    """One-way delays of the set-points that arrive; the link's delay if none does."""
     late_s = _set_points(scenario, link, rng)[1]
     arrived_s = late_s[np.isfinite(late_s)]
     return arrived_s if len(arrived_s) else np.array([link.delay_max_s])
 
 
 class _Heard(NamedTuple):
-    """When states arrived at the station (s), in order, and the instant of the newest one known then (s), both (k,)."""
+    """Times of arrival of states at the station, ascending, and the sampling time of the newest so far, both (k,)."""
 
     arrived_s: FloatArray
     newest_s: FloatArray
@@ -253,12 +253,12 @@ def _heard_over(scenario: Scenario, link: Link, rng: np.random.Generator) -> _He
 
 
 def _longest_repetition(scenario: Scenario) -> int:
-    """For how many ticks a state is repeated at most because telemetry is slower."""
+    """Maximum number of ticks for which a state is used again because telemetry is slower than control."""
     return ceil(scenario.rates.control_hz / scenario.rates.telemetry_hz * (1.0 - 1e-4)) - 1
 
 
 def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -> FloatArray:
-    """Ages of the newest state at random ticks, less how long slower telemetry was repeated; of several, the oldest."""
+    """Ages of the newest state at random ticks, minus the time it was used again; of several vehicles, the oldest."""
     every, rates = [_heard_over(scenario, up, rng) for up in ups], scenario.rates
     shape, period_s = (_PHASES, _MOST // 2 // _PHASES), 1.0 / rates.control_hz
     constant_s = np.full(shape, max(up.delay_max_s for up in ups))
@@ -280,10 +280,10 @@ def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -
 
 
 def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Generator) -> FloatArray:
-    """Ages (s) of the oldest of the newest states of several vehicles, less how long it was repeated.
+    """Ages (s) of the oldest of the newest states of several vehicles, minus the time it was used again.
 
-    Whose state is the oldest changes within a period of slower telemetry, with the phases of the vehicles, which are
-    drawn anew `_DRAWS` times. Empty if next to nothing arrives.
+    Which vehicle's state is the oldest changes within a period of slower telemetry, and depends on the phases of the
+    vehicles, which are drawn `_DRAWS` times. Empty if next to nothing arrives.
     """
     period_s, longest = 1.0 / scenario.rates.control_hz, _longest_repetition(scenario)
     room_s = min(float(own.newest_s[-1] - own.arrived_s[0]) for own in every)
@@ -301,7 +301,7 @@ def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Genera
 
 
 def _lost(link: Link, count: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of so many datagrams are lost, or corrupt, which receivers drop."""
+    """Which of `count` datagrams are lost or corrupt; receivers drop corrupt ones."""
     lost = rng.random(count) < 1.0 - (1.0 - link.loss_probability) * (1.0 - link.corrupt_probability)
     if (bursts := link.loss_bursts) is None:
         return lost

@@ -23,12 +23,12 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Responses:
-    """The response of each vehicle by system id, and where it is from."""
+    """The response of each vehicle by system id, and whether it was given or identified."""
 
     source: Literal["given", "identified"]
     of: Mapping[int, Response]
     misfit: Mapping[int, float] = field(default_factory=dict[int, float])
-    """The share of each vehicle's velocity that its identified response leaves unexplained."""
+    """The share of each vehicle's velocity that its identified response does not explain."""
 
     def in_order(self, system_ids: Sequence[int]) -> tuple[Response, ...]:
         """The responses of these vehicles.
@@ -42,7 +42,7 @@ class Responses:
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """What the station flies: the formation, the gains and the margin they have."""
+    """The plan that the station flies: the formation, the gains and their margins."""
 
     scenario: Scenario
     formation: Formation
@@ -51,18 +51,18 @@ class FlightPlan:
     delay_margin_s: float
     """NaN where it is unknown."""
     slower: tuple[tuple[FloatArray, float], ...] = ()
-    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
+    """The rest of the gain schedule: gain matrices and their delay margins, in ascending order of the margin."""
     separable: bool = True
-    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
+    """Whether every vehicle closes its own loop with its own margin, as in a leader-follower tree."""
     responses: Responses | None = None
     """The vehicles' responses; None if they are immediate, or not yet known."""
     around_loss: tuple[FloatArray, ...] = ()
-    """Flown in place of `gains` while a vehicle is lost; empty if those serve. A leader-follower tree stays stable when
-    the nearest vehicle ahead stands in for a lost one. Gains on another pattern may need all of their terms, so
+    """Flown instead of `gains` while a vehicle is lost; empty if `gains` can stay. A leader-follower tree stays stable
+    when the nearest vehicle ahead stands in for a lost one. Gains on another pattern may need all of their terms, so
     inclusion gains of the same delay margin replace them; the step in the commands is accepted."""
     own_margins_s: Mapping[int, tuple[float, ...]] = field(default_factory=dict[int, tuple[float, ...]])
-    """What the loop delay of single vehicles may be (s) with each of the gains, by row, where the formation's margins
-    are not theirs: infinite if none of their feedback is late."""
+    """Delay margins (s) with each of the gains, by row, of single vehicles to which the formation's margins do not
+    apply; infinite if none of their feedback is delayed."""
     law: Callable[..., Any] | None = None
     """The scenario's own control law (`gcs.plan.own_law.Law`), which is flown instead of `gains`."""
 
@@ -77,7 +77,7 @@ class FlightPlan:
 
     @cached_property
     def tolerance(self) -> Callable[[float], Tolerated]:
-        """How far the loop delay may be from the assumed one, as a function of the assumed one (s)."""
+        """How far the loop delay may be from the assumed delay (s), as a function of the latter."""
         prediction = self.scenario.control.prediction
         if prediction == "off":
             without = Tolerated((inf,) * len(self.margins_s), self.margins_s)
@@ -91,7 +91,7 @@ class FlightPlan:
         return lambda _: fixed
 
     def tolerance_of(self, row: int, assumed_s: float) -> Tolerated:
-        """The same for one vehicle."""
+        """The tolerance for one vehicle."""
         own_s = self.own_margins_s.get(row)
         return self.tolerance(assumed_s) if own_s is None else Tolerated((inf,) * len(own_s), own_s)
 
@@ -101,7 +101,7 @@ class FlightPlan:
         return None if self.responses is None else self.responses.in_order(self.formation.system_ids)
 
     def predicted(self, K: FloatArray) -> Predicted:
-        """The formation with one of its gains, as it is predicted."""
+        """The predicted formation with one of the gains."""
         timing, onboard = self.timing, onboard_timing(self.scenario)
         return Predicted(self.model, K.tobytes(), timing, self.responses_in_order, onboard)
 
@@ -117,7 +117,7 @@ class FlightPlan:
 
     @property
     def timing(self) -> Timing:
-        """How often the station hears and commands."""
+        """The periods of control and telemetry."""
         return loop_timing(self.scenario)
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
@@ -145,18 +145,18 @@ def onboard_timing(scenario: Scenario) -> OnboardTiming | None:
 
 
 def given_response(scenario: Scenario) -> Response | None:
-    """The scenario's response, which all its vehicles have."""
+    """The response that the scenario gives, the same for all its vehicles; None if it gives none."""
     return None if scenario.response is None else Response(**scenario.response.model_dump())
 
 
 def given_responses(scenario: Scenario) -> Responses | None:
-    """The same, as that of each of the vehicles."""
+    """The response that the scenario gives, assigned to each vehicle; None if it gives none."""
     given = given_response(scenario)
     return None if given is None else Responses("given", {own.system_id: given for own in scenario.vehicles})
 
 
 def at_once(steps: Generator[None, None, Found]) -> Found:
-    """The result of what is otherwise computed in steps between control ticks."""
+    """Run to its end a computation that a flight spreads over steps between control ticks, and return its result."""
     while True:
         try:
             next(steps)
@@ -167,8 +167,8 @@ def at_once(steps: Generator[None, None, Found]) -> Found:
 def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None, list[float]]:
     """The margin (s) of each of the plan's gains, computed in steps.
 
-    Where every vehicle's loop has a margin of its own and both axes are alike, a step is one vehicle, some milliseconds
-    (`gains.performance.lone_margin`). Otherwise it is `sampled_margin` of all vehicles together.
+    If every vehicle closes its own loop and both axes are alike, a step is one vehicle, some milliseconds
+    (`gains.performance.lone_margin`). Otherwise a step is `sampled_margin` of all vehicles together.
     """
     of, margins_s = responses.in_order(plan.formation.system_ids), list[float]()
     for K in plan.gains:

@@ -11,11 +11,11 @@ from scenarios.schema import Scenario
 
 @dataclass(frozen=True)
 class Formation:
-    """The vehicles of a formation, in an order in which each comes after the one it follows."""
+    """The vehicles of a formation, each listed after the one it follows."""
 
     system_ids: tuple[int, ...]
     model: FormationModel
-    """Who follows whom, and the error model that follows from it."""
+    """Who follows whom, and the resulting error model."""
     offset_ne_m: FloatArray
     """Wanted position relative to the vehicle in front when the flight begins, (n, 2); zero for the leader."""
 

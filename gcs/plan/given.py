@@ -1,4 +1,4 @@
-"""Puts gains, found by a search or by a user, into a scenario that can be written, checked and flown."""
+"""Puts gains from a search or a user into a scenario, which can then be written, checked and flown."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -17,7 +17,7 @@ from scenarios.schema import Control, FixedGains, GainBlock, Scenario
 def with_given(
     scenario: Scenario, *, gains: FixedGains | None = None, blocks: tuple[GainBlock, ...] = (), prediction: Prediction
 ) -> Scenario:
-    """The scenario with gains or blocks given; of its requirements only the limit on growing errors is kept."""
+    """The scenario with given gains or blocks; of its requirements, only the limit on growing errors is kept."""
     old = scenario.control
     kept = {"loop": old.loop, "string_peak_max": old.string_peak_max, "execute_at": old.execute_at}
     control = Control.model_validate({**kept, "gains": gains, "blocks": blocks, "prediction": prediction})
@@ -26,7 +26,7 @@ def with_given(
 
 
 def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off") -> Scenario:
-    """The scenario with the gain K of u = +K e given, for north and east alike; other requirements are dropped.
+    """The scenario with a given K of u = +K e, the same for north and east; other requirements are dropped.
 
     K has a row for each vehicle and a column for each error of one axis, in the order of
     `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
@@ -47,7 +47,7 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
 def gain_blocks(
     K: RealArray, formation: Formation, links: Sequence[tuple[int, int]] | None = None
 ) -> tuple[GainBlock, ...]:
-    """K block by block, as a scenario gives it: of these links, or else those not zero and each vehicle's own."""
+    """K as the blocks of a scenario: those of `links`, or without them the nonzero ones and each vehicle's own."""
     model, ids = formation.model, formation.system_ids
     return tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))

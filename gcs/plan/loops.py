@@ -1,8 +1,8 @@
-"""The loops of a formation, each stable or not by itself, and how close its expected loop delays are to its edge.
+"""The loops of a formation, each stable or not by itself, and how close their expected loop delays are to instability.
 
-In a leader-follower tree every vehicle closes a loop of its own, and only its own link matters. Vehicles that also hear
-those behind them share a loop. It has a margin, which is a loop delay that all have; where their links differ, it says
-little: such a loop may break far below it or stand far above. What counts then is its growth at all of its loop delays.
+In a leader-follower tree every vehicle closes its own loop, and only its own link matters. Vehicles that also hear
+those behind them share a loop. Its margin assumes one loop delay for all. If links differ, that says little: the loop
+may break far below it or stand far above it. Its growth at the loop delays of all its vehicles then decides.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -17,15 +17,15 @@ from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
 
 _STEP, _STEPS = 0.1, 100
-"""Steps, in margins of the whole loop, in which the edge of a shared loop is searched, and their number."""
+"""Size, in margins of the loop, and number of the steps that search for a shared loop's edge of stability."""
 _HALVINGS = 8
 _MOST_BY_GROWTH, _MOST_SHARING = 6, 20
-"""Most vehicles of a shared loop whose edge is found by its growth rate, which takes seconds, and by any way at all."""
+"""Most vehicles of a shared loop whose edge of stability is found by growth rates, which takes seconds, and at all."""
 
 
 def is_modelled(plan: FlightPlan) -> bool:
-    """Whether the models of `plan_loops` describe the flights: not those of a law that is not linear, or of dynamics of
-    one's own, of which they tell only which vehicles are coupled."""
+    """Whether the models of `plan_loops` describe the flights. They do not for a nonlinear law or the user's own
+    dynamics, for which they tell only which vehicles are coupled."""
     return not isnan(plan.delay_margin_s) and plan.scenario.dynamics in BUILT_IN
 
 
@@ -45,22 +45,22 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
 
 
 def loop_of(plan: FlightPlan, system_id: int) -> CoupledBlock:
-    """The loop of a vehicle."""
+    """The loop that contains a vehicle."""
     return next(block for block in plan_loops(plan) if system_id in block.system_ids)
 
 
 def growth_1_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
-    """The growth at expected loop delays."""
+    """The growth rate (1/s) of a loop at expected loop delays (s)."""
     return block.growth_at_1_s(loop_delay_s, _ages_s(block, loop_delay_s))
 
 
 def _ages_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> dict[int, float]:
-    """The ages of states at the station: half of the link delay and of the waiting have passed."""
+    """The ages of states at the control tick: half the link delay, plus the mean wait for the tick."""
     return {own: (at_s + block.timing.faster_s / 2.0) / 2.0 for own, at_s in loop_delay_s.items()}
 
 
 def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
-    """Whether a loop is predicted to be stable at expected loop delays, by the number of its roots.
+    """Whether a loop is predicted to be stable at expected loop delays, by counting its roots.
 
     In flights with three vehicles this was right to 0.2 % of the delay on the ground, and to 0.02 % on board.
     """
@@ -69,17 +69,17 @@ def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int,
 
 
 def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
-    """The growth (1/s) predicted of a vehicle's loop at its loop delay (s), with all other links as in the scenario."""
+    """The predicted growth rate (1/s) of a vehicle's loop, as a function of its loop delay (s); other links stay."""
     block, expected_s = loop_of(plan, system_id), planned_loop_delays_s(plan)
     return lambda delay_s: growth_1_s(block, expected_s | {system_id: delay_s})
 
 
 def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Window:
-    """The loop delays of one vehicle between which its loop is predicted to be stable; NaN if no model predicts it.
+    """Range of one vehicle's loop delays in which its loop is predicted to be stable; NaN if no model predicts it.
 
-    The links of all other vehicles stay as they are in the scenario. In a shared loop that is unstable over them, the
-    shorter delays of this vehicle are searched; (0, 0) if none makes it stable. Its ends are where the growth changes
-    sign, which agrees with flights to 0.1 %; `quick` or for many vehicles, where the number of roots changes.
+    The links of all other vehicles stay as they are in the scenario. If a shared loop is unstable over the scenario's
+    links, shorter delays of this vehicle are searched; the result is (0, 0) if none makes it stable. The growth changes
+    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead.
     """
     block = loop_of(plan, system_id)
     if not is_modelled(plan):
@@ -105,7 +105,7 @@ def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Windo
 
 
 def _edge_s(is_stable_at: Callable[[float], bool], at_s: float, step_s: float, *, end_s: float, stable: bool) -> float:
-    """Where stability ends or, if the loop is not `stable` to begin with, begins; `end_s` if it does not."""
+    """The delay at which stability ends or, if the loop is not `stable` at first, begins; `end_s` if there is none."""
     for _ in range(_STEPS):
         inner_s, at_s = at_s, at_s + step_s
         at_s = max(0.0, at_s)
@@ -120,7 +120,7 @@ def _edge_s(is_stable_at: Callable[[float], bool], at_s: float, step_s: float, *
 
 
 def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int]:
-    """The vehicles whose loops are predicted to be unstable over the scenario's links, outside the loop of `but`."""
+    """The vehicles whose loops are predicted to be unstable over the scenario's links, except the loop of `but`."""
     expected_s = planned_loop_delays_s(plan)
     loops = plan_loops(plan) if is_modelled(plan) else []
     unstable = [each for each in loops if but not in each.system_ids and not _is_stable(plan, each, expected_s)]
@@ -128,9 +128,9 @@ def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int
 
 
 def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
-    """Whether vehicles share this loop over links that differ, so that its margin says little, and a model knows more.
+    """Whether vehicles share this loop over different links, where its margin says little and a model says more.
 
-    Never with prediction, nor with more vehicles than are searched.
+    Always false with prediction, without a model, and for more vehicles than are searched.
     """
     if plan.scenario.control.prediction != "off" or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
         return False
@@ -139,9 +139,9 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
 
 def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
-    """How much more delay each vehicle's link takes with all others as in the scenario: NaN where it is not known.
+    """How much more delay (s) each vehicle's link can take, all others as in the scenario; NaN where unknown.
 
-    In a shared loop on board it is not: a link up delays the commands of others, too.
+    It is unknown in a shared loop on board, where an up link also delays the commands of others.
     """
     now_s, windows, left_s = effective_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
@@ -156,9 +156,9 @@ def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
 
 
 def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
-    """The margin (s) of each of the plan's gains over the scenario's links; None where those for equal delays serve.
+    """The margin (s) of each of the plan's gains over the scenario's links; None if the margins for equal delays apply.
 
-    They do unless vehicles share a loop over links that differ. Then the margin counts for the slowest of them.
+    They apply unless vehicles share a loop over different links. The margin is then that of the slowest vehicle.
     """
     if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
         return None
@@ -174,7 +174,7 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
 def plan_over_links(plan: FlightPlan) -> FlightPlan:
     """The plan with its margins over the scenario's links.
 
-    The plan itself where those for equal delays serve, or vehicles have responses that are not known yet.
+    Returns the plan itself if the margins for equal delays apply, or if responses of vehicles are not known yet.
     """
     known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
     margins_s = margins_over_links_s(plan) if known else None
@@ -185,11 +185,11 @@ def plan_over_links(plan: FlightPlan) -> FlightPlan:
 
 
 def _own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, tuple[float, ...]]:
-    """What the loop delay of each vehicle alone may be (s) with each of the plan's gains, by row.
+    """Delay margins (s) of single vehicles with each of the plan's gains, by row, all other links as in the scenario.
 
-    Only of vehicles that share a loop on the ground over links that differ, all others as in the scenario. `margins_s`
-    are those of `margins_over_links_s`: the slowest vehicle keeps them if they are less, and all do if their links are
-    past them.
+    They are only for vehicles that share a loop on the ground over different links. `margins_s` are those of
+    `margins_over_links_s`. The slowest vehicle keeps these if they are smaller, and all vehicles keep them if the links
+    already exceed them.
     """
     expected_s, own_s = planned_loop_delays_s(plan), dict[int, list[float]]()
     if plan.scenario.control.loop == "onboard":
@@ -209,7 +209,7 @@ def _own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, 
 
 
 def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """The margins, infinite, of the vehicles none of whose feedback is late, by row; empty if all are such."""
+    """Infinite margins, by row, for the vehicles without any delayed feedback; empty if no vehicle has any."""
     row, blocks = plan.formation.row, plan_loops(plan)
     late = [block for block in blocks if block.has_late_terms]
     at_once = [own for block in blocks if not block.has_late_terms for own in block.system_ids]
@@ -217,7 +217,7 @@ def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
 
 
 def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
-    """How many times its expected loop delays a loop takes that vehicles share; 0 if it is unstable at any."""
+    """The factor on its expected loop delays at which a shared loop breaks; 0 if it is unstable at any delays."""
     expected_s = planned_loop_delays_s(plan)
     own_s = {own: expected_s[own] for own in block.system_ids}
     if block.margin_s() == inf:

@@ -22,17 +22,17 @@ from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import Scenario
 
 Window = tuple[float, float]
-"""The shortest and the longest loop delay (s) between which a loop is stable."""
+"""The range of loop delays (s) in which a loop is stable: shortest and longest."""
 TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
-"""Assumed delays at which the windows are computed if the delay is measured."""
+"""Assumed delays (s) at which windows are tabulated if the station assumes the measured delay."""
 _MOST_ON_THE_WAY = 2000
-"""Most commands on their way for which the sampled window is computed."""
+"""Maximum number of commands in transit for which the sampled window is computed."""
 
 
 def used_s(shorter_s: float, longer_s: float, mismatch_s: float) -> float:
-    """How much of `longer_s` a mismatch (loop delay minus assumed) uses; one of -`shorter_s` uses all of it.
+    """How much of `longer_s` a mismatch (loop delay minus assumed) uses up; one of -`shorter_s` uses all of it.
 
-    Infinite if the loop delay is shorter than assumed and no shorter one is tolerated; nothing if every one is.
+    If the loop delay is shorter than assumed: infinite if no shorter one is tolerated, zero if every one is.
 
     >>> used_s(0.1, 0.2, 0.05), used_s(0.1, 0.2, -0.05), used_s(inf, 0.2, -0.05)
     (0.05, 0.1, 0.0)
@@ -59,10 +59,10 @@ class Tolerated(NamedTuple):
 
 
 class Tabulated:
-    """The tolerance at any assumed delay, rounded to the millisecond, interpolated between computed windows.
+    """The tolerance at any assumed delay, interpolated between tabulated windows; the delay is rounded to 1 ms.
 
-    The reciprocals of the distances are interpolated, because they are nearly linear: about k1 + k3 tau^. If only one
-    of two neighbouring windows has a lower end, its distance is used.
+    Interpolation is of the reciprocals of the distances, because they are nearly linear: about k1 + k3 tau^. If only
+    one of two neighbouring windows has a lower end, its distance is used.
     """
 
     def __init__(self, windows: Sequence[Sequence[Window]]) -> None:
@@ -96,14 +96,14 @@ def distances(window: Window, assumed_s: float) -> tuple[float, float]:
 
 
 class Predicted(NamedTuple):
-    """A formation that its station predicts, as a key of what is computed of it once."""
+    """A formation whose station predicts, as a key for cached results."""
 
     model: FormationModel
     gain: bytes
     """K of u = K e."""
     timing: Timing
     responses: tuple[Response, ...] | None = None
-    """Of the vehicles in the model's order; None if they respond at once."""
+    """Responses of the vehicles in the model's order; None if they respond at once."""
     onboard: OnboardTiming | None = None
     """The timing of the vehicles' own loops, if they have one."""
 
@@ -112,7 +112,7 @@ class Predicted(NamedTuple):
         return np.frombuffer(self.gain).reshape(self.model.inputs, self.model.states)
 
     def loop(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
-        """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
+        """A, B and K, and which states are measured: the errors, but not the states of the responses."""
         model, K = self.model, self.K
         if self.onboard is not None:
             return streamed_loop(model, K, self.onboard), None
@@ -126,9 +126,9 @@ class Predicted(NamedTuple):
 def window(flown: Predicted, assumed_s: float) -> Window:
     """The mismatch window of a sampled formation that is predicted over `assumed_s`.
 
-    The map of one period has a state for each command on its way. Where these are too many, the window is that of the
-    continuous model, narrowed at either end by a common period of both rates, which is more than the models differ.
-    Cached: all flights of a campaign use the same windows.
+    The map of one period has a state for each command in transit. If these are too many, the window is that of the
+    continuous model, narrowed at either end by a common period of both rates, which exceeds the difference of the
+    models. Cached: all flights of a campaign use the same windows.
     """
     if assumed_s > _MOST_ON_THE_WAY * flown.timing.faster_s:
         least_s, most_s = continuous_window(flown, assumed_s)
@@ -138,15 +138,15 @@ def window(flown: Predicted, assumed_s: float) -> Window:
 
 
 def continuous_window(flown: Predicted, assumed_s: float) -> Window:
-    """The mismatch window of the continuous model, without any hold, as the continuous delay margin is."""
+    """The mismatch window of the continuous model, without any hold, like the continuous delay margin."""
     loop, measured = flown.loop()
     return mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=measured)
 
 
 def proved_jump_s(flown: Predicted, assumed_s: float) -> float | None:
-    """How early or late (s) each set-point may act with the formation proved stable, at a constant age of telemetry.
+    """How early or late (s) each set-point may act while the formation is proved stable, at a constant telemetry age.
 
-    None for loops on board and for vehicles in a loop with others, to which `PredictedSpread` does not apply.
+    None for loops on board and for shared loops, to which `PredictedSpread` does not apply.
     """
     loop, measured = flown.loop()
     if flown.onboard is not None or any(len(each) > 1 for each in flown.model.coupled_vehicles(flown.K)):
@@ -155,7 +155,7 @@ def proved_jump_s(flown: Predicted, assumed_s: float) -> float | None:
 
 
 def assumption(scenario: Scenario) -> str:
-    """What prediction assumes of the set-points sent, as a line; empty without prediction."""
+    """What the prediction assumes about the set-points sent, as one line; empty without prediction."""
     as_sent, on_board = "every set-point acts as it was sent", scenario.control.loop == "onboard"
     if scenario.control.prediction == "off":
         return ""

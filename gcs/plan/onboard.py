@@ -1,9 +1,9 @@
-"""Planning with loop "onboard": what vehicles feed back by themselves, and what is left to the station.
+"""Planning with loop "onboard": which feedback the vehicles compute, and which the station streams to them.
 
 u_i(t) = K_ii e_i(t) + sum over j of K_ij e_j(t - tau) (thesis eq. 5.1). The vehicle computes the first term from its
 own velocity and its own sensor for the vehicle ahead; its gains are the parameters that `own_parameters` names. The
-station computes the second and sends it as the acceleration of SET_POSITION_TARGET_LOCAL_NED, a feed-forward as
-autopilots understand it, with the formation's velocity v_d as the velocity.
+station computes the second term and sends it as the acceleration of SET_POSITION_TARGET_LOCAL_NED, which autopilots
+treat as feed-forward, with the formation's velocity v_d as the velocity.
 """
 
 from dataclasses import asdict, replace
@@ -21,15 +21,15 @@ from gcs.plan.formation import Formation
 
 AXES = "NE"
 _STILL_1_S = 1e-6
-"""Own loops may hold an error, to rounding: what the station computes of them must not grow."""
+"""Growth of own loops that counts as zero: they may keep an error, within rounding, but a prediction must not grow."""
 
 
 def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the onboard loop, from those of a ground loop with the same gains.
 
-    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. Slower
-    entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any stream the
-    formation is stable at every delay; where vehicles act on each other both ways, it flies so while one is lost.
+    Own gains are rounded to float32, in which they are uploaded: the analysed gains are those flown. Slower entries of
+    the schedule keep the vehicles' own gains and reduce the share of the stream. Without any stream the formation is
+    stable at every delay. It flies without a stream while a vehicle is lost, if vehicles share loops.
     """
     timing = onboard_timing(plan.scenario)
     assert timing is not None
@@ -73,9 +73,9 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:
     """Names and values of the parameters with which a vehicle flies its own loop.
 
-    FORM_AHEAD is the system id of the vehicle ahead, 0 for the leader, FORM_OFF_N and _E the wanted position relative
-    to it; FORM_KP_xy and FORM_KV_xy are the gains from spacing and velocity error in y to acceleration in x. FORM_LOOP,
-    the last, switches the loop on.
+    FORM_AHEAD is the system id of the vehicle ahead, 0 for the leader, and FORM_OFF_N and _E are the wanted position
+    relative to it. FORM_KP_xy and FORM_KV_xy are the gains from spacing and velocity error in y to acceleration in x.
+    FORM_LOOP, the last, switches the loop on.
     """
     model = formation.model
     ahead = model.predecessors[row]

@@ -1,9 +1,9 @@
-"""The user's own control law: what it is called with, and the design and plan of a scenario that names one.
+"""The user's own control law: its arguments, and the design and plan of a scenario that names one.
 
 A law is a function `law(t_s, states, formation, memory)` that returns the acceleration of each vehicle, (N, 2) in m/s²
-north and east. `states` are (N, 4), position and velocity north and east at one instant, in the order of
+north and east. `states` are (N, 4), position and velocity north and east, all at the same time, in the order of
 `formation.system_ids`; the row of a lost vehicle is NaN. `memory` is a dict, empty at the first call of a flight, and
-the only thing that a law may remember in. docs/how-to/own-law.md has the rest.
+the only state that a law may keep. For the rest see docs/how-to/own-law.md.
 """
 
 from collections.abc import Callable
@@ -32,26 +32,26 @@ OWN_DYNAMICS = "dynamics without [response], which gcs identify finds; or measur
 TOLERANCE = 1e-6
 """Largest difference between a law and its matrices, relative to the largest entry of K."""
 _STEP = 1e-3
-"""Error (m, m/s) of the differences by which a law is linearised."""
+"""Step (m, m/s) of the differences that linearise a law."""
 _CALLS = 3
-"""How often a law must give the same answer to the same errors to be called linear."""
+"""Number of successive calls in which a linear law must give the same answer to the same errors."""
 _SIZES = 1.0, -1.0, 50.0
-"""The law must agree with its matrices at these multiples of each error, or it is linear near the formation only."""
+"""The law must agree with its matrices at these sizes (m, m/s) of each error: near its place and far from it."""
 
 
 @dataclass(frozen=True, eq=False)
 class LawFormation:
-    """The formation as a law knows it: N vehicles, each after the one it follows."""
+    """The formation as a law sees it: N vehicles, each listed after the one it follows."""
 
     system_ids: tuple[int, ...]
     predecessors: tuple[int, ...]
-    """For each vehicle the row of the one in front; -1 for the leader, which comes first."""
+    """For each vehicle, the row of the one in front; -1 for the leader, which is row 0."""
     offset_ne_m: FloatArray
     """(N, 2): wanted position relative to the vehicle in front, north and east; zero for the leader."""
     nominal_velocity_ne_m_s: FloatArray
     """(2,): v_d at this time."""
     period_s: float
-    """Control period: a law is called once in it."""
+    """Control period: the law is called once in each."""
 
     @cached_property
     def model(self) -> FormationModel:
@@ -86,26 +86,26 @@ class LawFormation:
 
 
 Law = Callable[[float, FloatArray, LawFormation, dict[str, Any]], ArrayLike]
-"""A control law; see the text of this module."""
+"""A control law; see the docstring of this module."""
 
 
 def law_formation(
     formation: Formation, velocity_ne_m_s: tuple[float, float], period_s: float, opening: float = 1.0
 ) -> LawFormation:
-    """The formation for a law, at a nominal velocity; `opening` is a factor on the spacing."""
+    """The formation as an argument of a law, at a nominal velocity; `opening` scales the spacing."""
     offset_ne_m, velocity = opening * formation.offset_ne_m, np.array(velocity_ne_m_s)
     for array in (offset_ne_m, velocity):
-        array.flags.writeable = False  # a law remembers in its memory only
+        array.flags.writeable = False  # a law may keep state only in its memory
     return LawFormation(formation.system_ids, tuple(formation.model.predecessors), offset_ne_m, velocity, period_s)
 
 
 def law_of(scenario: Scenario) -> Law | None:
-    """The law that a scenario names; None if it names none. Runs its file."""
+    """Run the file of the law that a scenario names, and return the law; None if it names none."""
     return None if scenario.control.controller is None else function_of(scenario, "control.controller")
 
 
 def accelerations(answer: object, vehicles: int) -> FloatArray:
-    """The answer of a law as (N, 2). Raises ValueError if it is something else; numbers may be NaN or infinite."""
+    """The answer of a law as (N, 2). Raises ValueError for another shape or type; numbers may be NaN or infinite."""
     found = np.asarray(answer)
     if found.shape != (vehicles, 2) or found.dtype.kind not in "fiu":
         shape = f"shape {found.shape}" if found.dtype.kind in "fiu" else f"{type(answer).__name__}"
@@ -118,9 +118,9 @@ def own_plan(
 ) -> tuple[Design, FlightPlan]:
     """Design and plan of a scenario whose controller is code; `given_plan` makes those of gains given as blocks.
 
-    A law that states its K (`control.linear`) has the margin of K, after a check that the two agree. Any other is flown
-    with an unknown margin. Its gain is the law linearised at zero error; only the search for the onset uses it, to see
-    which vehicles are coupled.
+    A law with a stated K (`control.linear`) has the margin of K, after a check that the two agree. Any other is flown
+    with an unknown margin. The gain of its plan is the law linearised at zero error; only the search for the onset uses
+    it, to see which vehicles are coupled.
     """
     law, formation = law_of(scenario), plan_formation(scenario)
     assert law is not None
@@ -149,7 +149,7 @@ def own_plan(
 
 
 def with_unknown_margin(design: Design, plan: FlightPlan, why: str) -> tuple[Design, FlightPlan]:
-    """Design and plan without margins, and without the figures that hold for vehicles that respond at once."""
+    """Design and plan without margins, and without figures that hold only for vehicles that respond at once."""
     none = {"delay_margin_s": None, "delay_margin_continuous_s": None}
     schedule = tuple(
         entry.model_copy(update=none | {"alpha": None, "decay_rate_1_s": None}) for entry in design.schedule
@@ -175,12 +175,12 @@ def why_unknown(plan: FlightPlan) -> str:
 
 
 def code_records(scenario: Scenario) -> tuple[CodeRecord, ...]:
-    """The files of code of a scenario, as published; named as in the folder of a run."""
+    """The published records of a scenario's code files, named as in the folder of a run."""
     return tuple(CodeRecord(file=Path(code.name).name, sha256=code.sha256) for code in scenario.code)
 
 
 def code_by_key(scenario: Scenario) -> dict[str, CodeRecord]:
-    """For each key that names code, as "control.controller = my_law.py:law", its file."""
+    """The code file of each key that names one, under a text such as "control.controller = my_law.py:law"."""
     known = {code.name: code.sha256 for code in scenario.code}
     named = {f"{key} = {name}": name.rpartition(":")[0] for key, name in code_names(scenario).items()}
     return {text: CodeRecord(file=path, sha256=known[path]) for text, path in named.items()}
@@ -201,7 +201,7 @@ def _given_gain(scenario: Scenario, formation: LawFormation) -> FloatArray:
 
 
 def _check(scenario: Scenario, law: Law, K: FloatArray, formation: LawFormation) -> None:
-    """Refuse a law that is not u = K e: without errors, and at small and large errors of each kind, call after call."""
+    """Refuse a law unless it equals u = K e at zero error and at small and large errors of each kind, in every call."""
     scale = float(np.abs(K).max())
     for size in (0.0, *_SIZES):
         for k in range(K.shape[1] if size else 1):
@@ -241,6 +241,6 @@ def _linearised(law: Law, formation: LawFormation) -> FloatArray:
         except Exception:  # noqa: BLE001 - whatever the user's law raises; the flight counts it
             continue
         K[:, k] = np.where(np.isfinite(column), column, 0.0)
-    # differences leave noise, which would couple all vehicles and make equal ones differ
+    # round away the noise of the differences, which would couple all vehicles and make equal ones differ
     scale = TOLERANCE * float(np.abs(K).max(initial=0.0))
     return scale * np.round(K / scale) if scale else K

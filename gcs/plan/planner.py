@@ -1,4 +1,4 @@
-"""From a scenario to what is flown: formation, gains, margins."""
+"""Makes the design and the flight plan of a scenario: formation, gains, margins."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -59,18 +59,18 @@ MEASURED_WANTED = (
 )
 NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
-"""Least and largest delay margin of the gains flown around a lost vehicle."""
+"""Smallest and largest delay margin (s) of the gains flown around a lost vehicle."""
 _REQUIRED = "delay_margin_s", "alpha", "decay_rate_1_s", "string_peak_max", "loop"
 _SHOWN_S = (0.1, 0.3, 0.6, 1.0, 1.5, 3.0)
-"""Assumed delays whose windows a design shows, if they tolerate a control period of mismatch."""
+"""Assumed delays (s) whose windows a design shows, if they tolerate a mismatch of one control period."""
 _MORE = 1.1
-"""A design whose margin falls short at these rates is repeated for a margin larger by this times the shortfall."""
+"""A design whose margin falls short at the scenario's rates is repeated with this times the shortfall added."""
 
 
 def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Design, FlightPlan]:
-    """The design of a scenario, with what was measured of its links, and the plan to fly it.
+    """The design of a scenario, which records its measured links if `link` is given, and the plan to fly it.
 
-    Raises gains.core.errors.GainsError if the scenario's requirement cannot be met.
+    Raises gains.core.errors.GainsError if the requirement cannot be met, gcs.errors.InputError if links are unmeasured.
     """
     if scenario.control.for_link == "measured":
         raise InputError(f"{scenario.name}: control.for_link: {MEASURED_WANTED}")
@@ -90,7 +90,7 @@ def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Desig
 def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     """Design and plan of gains that are designed or given, by inclusion or on an information pattern.
 
-    Slowed down by a factor s, K1 / s, K2 / s and K3 / s² move the loop s times slower and take s times the delay.
+    With K1 / s, K2 / s and K3 / s² the loop is s times slower and takes s times the delay.
     """
     formation, period_s = plan_formation(scenario), loop_timing(scenario).held_s
     model, scales, control = formation.model, scenario.monitor.time_scales, scenario.control
@@ -132,7 +132,7 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan with their margins over the scenario's links, where vehicles share a loop over links that differ.
+    """Design and plan with their margins over the scenario's links, if vehicles share a loop over different links.
 
     Otherwise, and for vehicles whose response is not known yet, they stay as they are.
     """
@@ -145,7 +145,7 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
 
 
 def _with_own_margins(design: Design, plan: FlightPlan) -> Design:
-    """The design with the margins of single vehicles that its plan is flown by."""
+    """The design with the plan's margins of single vehicles."""
     every = zip(plan.formation.system_ids, map(plan.own_margins_s.get, range(plan.model.vehicles)), strict=True)
     own = tuple(OwnMargins(system_id=k, delay_margins_s=tuple(map(plain, own_s))) for k, own_s in every if own_s)
     return design.model_copy(update={"own_margins": own})
@@ -154,7 +154,7 @@ def _with_own_margins(design: Design, plan: FlightPlan) -> Design:
 def with_trade_off(design: Design) -> Design:
     """The design with the best α at other delay margins, which takes longer to compute than all its other figures.
 
-    Gains on a general pattern have none.
+    Unchanged for gains on a pattern, and for an unknown margin.
     """
     if design.inclusion_gains is None or design.margin_unknown:
         return design
@@ -166,7 +166,7 @@ def with_trade_off(design: Design) -> Design:
 
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of the scenario's loop, from those of its ground loop, with the figures at its delay."""
+    """Design and plan of the loop as flown, from those of its ground loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
         plan = replace(plan, own_margins_s=unlimited(plan))
@@ -178,10 +178,10 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
 
 def _prediction(plan: FlightPlan) -> PredictionPart:
-    """The mismatch windows of the fastest gains. Also computes the plan's tolerance, which no tick can wait for."""
+    """The mismatch windows of the fastest gains. Also computes the plan's tolerance, too slow for a control tick."""
     assumed_s = plan.assumed_s
     plan.tolerance(assumed_s or 0.0)
-    # gains chosen for a short delay tolerate next to nothing over a long one, where the continuous model takes seconds
+    # gains for a short delay tolerate almost nothing over a long one, where the continuous model takes seconds
     flown = plan.predicted(plan.gain)
     fits = [at_s for at_s in _SHOWN_S if window(flown, at_s)[1] > at_s + plan.timing.held_s]
     found = {
@@ -200,7 +200,7 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
     if responses is None and plan.scenario.dynamics == "autopilot":
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
-    if responses is None and plan.timing.commands == 1:  # the design was found for these
+    if responses is None and plan.timing.commands == 1:  # the case that the design was computed for
         return whole, plan
     if responses is not None:
         plan = plan.with_margins(tuple(at_once(margin_steps(plan, responses))), responses)
@@ -211,9 +211,9 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
 
 
 def identified(design: Design, plan: FlightPlan) -> Design:
-    """The design with the vehicles' responses and its sampled margins with them.
+    """The design with the vehicles' responses, and with its sampled margins for these.
 
-    Its other figures, which take a second to compute, are left out: a station in flight cannot wait for them.
+    Its other figures take a second to compute and are left out: a station in flight cannot wait for them.
     `delay_margin_at_once_s` is the margin of the same gains on vehicles that respond at once.
     """
     assert plan.responses is not None
@@ -237,14 +237,14 @@ def identified(design: Design, plan: FlightPlan) -> Design:
 
 
 def described(design: Design, plan: FlightPlan) -> Design:
-    """The design with the vehicles' responses, and all its figures with them."""
+    """The design with the vehicles' responses, and with all its figures for these."""
     known = identified(design, plan)
     assert plan.responses is not None
     assert known.response is not None
     every = plan.responses.in_order(plan.formation.system_ids)
     continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
     response = known.response
-    if (gains := design.inclusion_gains) is not None:  # the same for each vehicle, as on a leader-follower tree only
+    if (gains := design.inclusion_gains) is not None:  # equal for all vehicles, which only a leader-follower tree has
         fed = design.feed_forward
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
@@ -304,7 +304,7 @@ def _graph_design(scenario: Scenario, formation: Formation, pattern: Pattern) ->
 
 
 def pattern_of(scenario: Scenario, formation: Formation) -> Pattern:
-    """Who may use whose errors."""
+    """The information pattern of a scenario: which vehicle may use whose errors."""
     row, tree = formation.row, leader_follower(formation.model)
     if scenario.control.blocks:
         none = without_links(tree, tree.links)

@@ -1,7 +1,7 @@
 """The axes of a campaign: the quantities of a scenario that vary, and their values.
 
-Here *link delay* is the total of a vehicle's two links, up plus down, which compares directly with the delay margin:
-the loop delay is the link delay plus the time, less than one period, that telemetry waits for the next control tick.
+Here *link delay* is the sum of a vehicle's two links, up plus down. The loop delay is the link delay plus the wait of
+telemetry for the next control tick, which is less than one period, so link delays compare directly with the margin.
 The up link takes a whole number of control periods, as near to half as possible, and the down link takes the rest. The
 loop delay then grows evenly with the link delay. With any other split the wait would jump by a period whenever the up
 link crossed a whole period.
@@ -44,7 +44,7 @@ _LABELS = {
 }
 _FORM = "FROM:TO:N"
 _MOST = 10_000
-"""Most values of an axis."""
+"""Maximum number of values on an axis."""
 _RANGES = {
     "delay": (0.0, 60.0, " s"),
     "jitter": (0.0, 10.0, " s"),
@@ -52,11 +52,11 @@ _RANGES = {
     "rate": (1.0, 500.0, " Hz"),
     PREDICTION: (0.0, PREDICTION_MAX_S, " s"),
 }
-"""The least and the largest value on each axis, and its unit."""
+"""Smallest and largest value allowed on each axis, and its unit."""
 
 
 def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis:
-    """The axis that an option's text describes: FROM:TO:N, or values separated by commas.
+    """Parse an option's text into an axis: FROM:TO:N, or values separated by commas.
 
     The text of --delay-of begins with the system id of a vehicle in `system_ids`: ID=FROM:TO:N. Raises InputError if
     the text has neither form, or a value is out of range.
@@ -89,8 +89,8 @@ def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis
 def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenario:
     """The scenario at one point of a campaign.
 
-    A rate applies to control, to telemetry if both rates were equal, and on board in proportion. Jitter keeps the
-    distribution of a link that has one; elsewhere it is uniform within ± the value.
+    A rate sets the control rate, and the telemetry rate too if the two were equal; rates on board scale in proportion.
+    Jitter keeps the distribution of a link that has one; on other links it is uniform within ± the value.
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
@@ -120,7 +120,7 @@ def has_constant_links(scenario: Scenario) -> bool:
 
 
 def every_link(scenario: Scenario) -> list[Link]:
-    """The links that all vehicles share, and those of single vehicles."""
+    """The scenario's default links, and those of single vehicles."""
     links = scenario.links
     return [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link is not None)]
 
@@ -138,7 +138,7 @@ def place_text(coordinates: Mapping[str, float]) -> str:
 
 
 def split_delay(total_s: float, period_s: float) -> tuple[float, float]:
-    """A total link delay as up, a whole number of periods, and down, the rest: about half each."""
+    """Split a total link delay into about half up, a whole number of periods, and the rest down."""
     up_s = round(round(total_s / 2.0 / period_s) * period_s, 12)
     return up_s, max(0.0, round(total_s - up_s, 12))
 

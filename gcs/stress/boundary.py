@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where the formation breaks in flight, by prediction, and where it cannot."""
+"""The map of a campaign with two axes: where it breaks in flight, where by prediction, and where it provably cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -36,8 +36,8 @@ def map_figure(
 ) -> Path | None:
     """Measured growth over two axes, averaged over the seeds, with the measured and the predicted boundaries.
 
-    The mark of each cell shows the worst verdict of its flights in `verdicts`. A third axis, the assumed delay of a
-    station that predicts, makes a map of each of its values, side by side in the same colours.
+    The mark of each cell shows the worst verdict of its flights in `verdicts`. With a third axis, the assumed delay of
+    a station that predicts, there is one map for each of its values, side by side in the same colours.
     """
     shown = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes if axis.name != PREDICTION]
     maps = [
@@ -64,7 +64,7 @@ def map_figure(
 
 
 def _predicting(study: Study, assumed_s: float | None) -> Study:
-    """The study of a station that predicts over this delay, 0 for one that does not; None leaves it as it is."""
+    """The study with prediction over this delay, without prediction for 0, or unchanged for None."""
     if assumed_s is None:
         return study
     scenario = at_coordinates(study.plan.scenario, {PREDICTION: assumed_s})
@@ -72,7 +72,7 @@ def _predicting(study: Study, assumed_s: float | None) -> Study:
 
 
 def _at_assumed(assumed_s: float | None, outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The outcomes at this assumed delay, which is left out of their coordinates; all of a map without such an axis."""
+    """The outcomes at this assumed delay, without it in their coordinates; all outcomes if the map has no such axis."""
     return [
         replace(own, coordinates={name: at for name, at in own.coordinates.items() if name != PREDICTION})
         for own in outcomes
@@ -83,7 +83,7 @@ def _at_assumed(assumed_s: float | None, outcomes: Sequence[Outcome]) -> list[Ou
 def _draw_map(
     plot: Any, study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome], measured: FloatArray, reach: float
 ) -> Any:
-    """Draw the cells and the boundaries of one map; returns what its colours mean."""
+    """Draw the cells and the boundaries of one map; returns its colours for the colour bar."""
     predicted = _cells(axes, outcomes, "predicted_growth_1_s")
     across, up = (np.array(axis.values) for axis in axes)
     plot.set_facecolor(_BLANK)
@@ -112,10 +112,10 @@ def _draw_map(
 
 
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
-    """(k, 2) link delays and the jitter below which the formation is proved stable however the delay varies.
+    """(k, 2) link delays, and the jitter below which the formation is proved stable however the delay varies.
 
-    None for other axes, for links with unbounded jitter or on which datagrams overtake each other, and for loops to
-    which no proof applies: those on board, and those of a station that predicts over the measured delay.
+    None if the axes are not delay and jitter, if jitter is unbounded, and for loops to which no proof applies: loops on
+    board and, with prediction, loops over the measured delay, of several vehicles, or over reordering links.
     """
     scenario, names = study.plan.scenario, [axis.name for axis in axes]
     if names != ["delay", "jitter"] or len(axes[0].values) < 2 or scenario.control.loop != "ground":
@@ -138,12 +138,12 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
 
 
 def _proved_s(blocks: Sequence[CoupledBlock], period_s: float, delays_s: FloatArray) -> FloatArray:
-    """The jitter proved at each link delay without prediction; below 0 where nothing is.
+    """The jitter proved stable at each link delay without prediction; negative where nothing is proved.
 
-    With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
-    between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
-    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
-    maximum (`gains.varying.bounds.varying_delay_bound`).
+    With link delay d, jitter of at most j each way, and period T of telemetry and control, the command in force was
+    computed from a state that is d - 2 j to d + 2 j + 2 T old. Two bounds cover that: one for deviations from the
+    middle (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), and one for any variation between
+    0 and a maximum (`gains.varying.bounds.varying_delay_bound`).
     """
     loops = [(block.A, block.B @ block.K) for block in blocks]
     try:
@@ -155,12 +155,12 @@ def _proved_s(blocks: Sequence[CoupledBlock], period_s: float, delays_s: FloatAr
 
 
 def _proved_predicted_s(block: CoupledBlock, assumed_s: float, delays_s: FloatArray) -> FloatArray:
-    """The jitter proved at each link delay for one vehicle, predicted; below 0 where nothing is.
+    """The jitter proved stable at each link delay for one predicted vehicle; negative where nothing is proved.
 
     With jitter of at most j each way, a state is between up - j and up + j + T old when it is first used. The assumed
-    delivery delay is the assumed loop delay less the mean of these ages, which may be any of them. A set-point then
-    acts d - 2 j to d + 2 j + T, less the assumed loop delay, after it is assumed to; d is the delay of both links. See
-    `gains.varying.predicted.PredictedSpread`.
+    delivery delay is the assumed loop delay minus the mean of these ages, which may lie anywhere in that range. A
+    set-point then acts later than assumed by d - 2 j to d + 2 j + T minus the assumed loop delay, where d is the delay
+    of both links. See `gains.varying.predicted.PredictedSpread`.
     """
     wait_s = block.timing.control_s
     spread = PredictedSpread(block.A, block.B, block.K, block.timing, assumed_s, block.measured)
@@ -180,10 +180,10 @@ def _proved_predicted_s(block: CoupledBlock, assumed_s: float, delays_s: FloatAr
 
 
 def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
-    """The edge of stability over the link delays of two vehicles, from the continuous model of the whole formation.
+    """The stability boundary over the link delays of two vehicles, from the continuous model of the whole formation.
 
-    Empty for other axes, for loops in which not all feedback is late, and for vehicles in a loop with others, whose
-    delays matter too.
+    Empty for other axes, for loops with feedback that is not delayed, and for vehicles that share a loop with others,
+    because the delays of those matter too.
     """
     plan, control = study.plan, study.plan.scenario.control
     all_late = control.loop == "ground" and control.prediction == "off"  # x' = A x + B K x(t - tau)
@@ -196,7 +196,7 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     A, B, K = formation_loop(model, plan.gain, plan.responses_in_order)
     late = late_by_vehicle(B, K, [model.input_slice(k) for k in range(model.vehicles)])
     others = sum((late[k] for k in range(model.vehicles) if k not in places), A)
-    # the link delay is the model's delay less the hold and the waiting for the control tick
+    # link delay = the model's delay - hold - wait for the control tick
     less_s = np.array([plan.timing.held_s / 2.0 + _waiting_s(outcomes, system_id) for system_id in ids])
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
     lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
@@ -211,10 +211,10 @@ def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
 def _mark(
     plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], *, dark: NDArray[np.bool_], decays: NDArray[np.bool_]
 ) -> None:
-    """Mark the worst verdict of each cell's own-state flights; light marks on dark cells.
+    """Mark each cell with the worst verdict of its flights; light marks on dark cells.
 
-    An error that persists where small errors decay is not an instability of the loop: large initial errors met a limit,
-    or random links keep pushing the vehicles.
+    An error that persists where small errors decay is not an instability of the loop: large initial errors reached a
+    limit, or random links keep pushing the vehicles.
     """
     across, up = (np.array(axis.values) for axis in axes)
     flown = [{outcome.verdict for outcome in cell} for cell in _of_cells(axes, verdicts)]
@@ -254,7 +254,7 @@ def _of_cells(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[list[Ou
 
 
 def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:
-    """A field as an array over two axes, mean of the seeds; NaN where no seed has it."""
+    """A field of the outcomes as an array over two axes, averaged over the seeds; NaN where no seed has it."""
     known = [[v for o in cell if (v := getattr(o, field)) is not None] for cell in _of_cells(axes, outcomes)]
     means = [float(np.mean(values)) if values else np.nan for values in known]
     return np.array(means).reshape([len(axis.values) for axis in axes])

@@ -1,8 +1,8 @@
 """Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
 The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
-finished trial. A later campaign resumes it: a trial whose id is stored is not flown again, unless `refly` is asked to:
-in virtual time it is then the same to the last bit, with files and a Rerun recording.
+finished trial. A resumed campaign does not fly trials whose id is stored. `refly` flies one of them again, with files
+and a Rerun recording; in virtual time it repeats to the last bit.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"
 _PR_SET_PDEATHSIG = 1
 _TRIALS_IN_TASK, _TASKS_OF_THREAD = 16, 4
-"""Trials that Dask sends as one task, at most, and the tasks that each of its threads gets, at least."""
+"""Maximum number of trials in one Dask task, and minimum number of tasks for each of its threads."""
 _Record = TypeVar("_Record")
 
 Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
@@ -41,9 +41,9 @@ Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
 
 
 class Store(Generic[_Record]):
-    """The flights of a study that are finished, by their keys, in a file of JSON lines.
+    """The finished flights of a study by key, in a file of JSON lines.
 
-    Raises InputError if another process has it open: both would fly the same.
+    Raises InputError if another process has the file open: both would fly the same trials.
     """
 
     def __init__(self, file: Path, kind: Callable[..., _Record], key: Callable[[_Record], Any]) -> None:
@@ -73,7 +73,7 @@ class Store(Generic[_Record]):
 
     @property
     def resume(self) -> str:
-        """What tells the user how to resume the study."""
+        """A sentence that tells the user how to resume the study."""
         return f"{len(self.flown)} flights are stored; continue with --resume --out {self.file.parent}"
 
     def close(self) -> None:
@@ -81,14 +81,14 @@ class Store(Generic[_Record]):
 
 
 def trials_of(folder: Path) -> Store[Outcome]:
-    """The finished trials of a campaign's folder."""
+    """The store of finished trials in a campaign's folder."""
     return Store(folder / TRIALS_FILE, Outcome, lambda outcome: outcome.id)
 
 
 def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | None = None) -> None:
-    """Refuse a folder without the file of a kind of study, or with a study of another scenario; `scenario` is TOML.
+    """Check that a folder holds a study of this kind, and of this scenario if `scenario` (TOML) is given.
 
-    Raises InputError with what was read and what was wanted.
+    Raises InputError, which says what was read and what was wanted, if it does not.
     """
     for name in (SCENARIO_FILE, file.name):
         if not file.with_name(name).is_file():
@@ -103,8 +103,8 @@ def run_campaign(
 ) -> list[Outcome]:
     """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
-    `ended` is called after each trial with the number still to come. Raises KeyboardInterrupt also if Ctrl-C
-    ended a flight in real time; that flight does not count as flown.
+    `ended` is called after each trial with the number left. Raises KeyboardInterrupt also if Ctrl-C ended a flight in
+    real time; that flight is not stored.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.flown}
     left = len(missing)
@@ -127,7 +127,7 @@ def run_campaign(
 class Reflown:
     """A trial flown again.
 
-    `differs` names the figures that changed since its first flight. It is empty in real time, where any may change.
+    `differs` names the fields that differ from its first flight. It is empty in real time, where any may differ.
     """
 
     outcome: Outcome
@@ -139,8 +139,8 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
     """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
 
     Its runs are left in `flights` beside the campaign's table. A study in real time flies it over UDP, even if it was
-    first flown in virtual time. Raises InputError if not exactly one id begins so, or the trial was flown with another
-    scenario.
+    first flown in virtual time. Raises InputError unless exactly one id begins with `wanted`, and if the trial was
+    flown with another scenario.
     """
     from gcs.views.observer import recover_run  # slow to import, and workers need none of it
 
@@ -173,7 +173,7 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
 def local_workers(
     count: int, run: Callable[[Any], Any] = fly_trial
 ) -> Generator[Callable[[Sequence[Any]], Iterator[Any]]]:
-    """While entered, fly trials in `count` processes; if one, in this process. `run` is what is done with a trial."""
+    """While entered, fly trials in `count` processes, in this one if `count` is 1. `run` is called for each trial."""
     if count == 1:
         yield partial(map, run)
         return
@@ -182,13 +182,13 @@ def local_workers(
 
         def fly(trials: Sequence[Any]) -> Iterator[Any]:
             if not pools:
-                # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
+                # spawn: a fork would copy locks held by threads of libraries that the user's process has loaded
                 spawn = get_context("spawn")
                 with held_back():  # multiprocessing's resource tracker, which starts here, would die of SIGHUP
                     pools.append(ProcessPoolExecutor(count, spawn, _prepare_worker, (os.getpid(),)))
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
-                with held_back():  # workers that are starting leave Ctrl-C to this process
+                with held_back():  # workers that are still starting must leave Ctrl-C to this process
                     futures = [pools[0].submit(run, trial) for trial in trials]
                 for future in as_completed(futures):
                     yield future.result()
@@ -204,8 +204,8 @@ def local_workers(
 def dask_workers(address: str, run: Callable[[Trial], Outcome] = fly_trial) -> Generator[Fly]:
     """While entered, fly trials on the workers of a Dask cluster, where this package is installed.
 
-    `run` is what a worker does with a trial. Raises InputError if `distributed` is not installed or there is no
-    scheduler at the address.
+    A worker calls `run` for each trial. Raises InputError if `distributed` is not installed or no scheduler answers at
+    the address.
     """
     try:
         from distributed import Client
@@ -222,7 +222,7 @@ def dask_workers(address: str, run: Callable[[Trial], Outcome] = fly_trial) -> G
         in_task = min(_TRIALS_IN_TASK, max(1, len(trials) // (_TASKS_OF_THREAD * max(1, threads))))
         futures: list[Any] = []
         for part in (trials[k : k + in_task] for k in range(0, len(trials), in_task)):
-            # the ids as key: a scheduler that still has the result for an earlier client returns it without a flight
+            # keyed by the ids: a scheduler that still holds the result of an earlier client returns it without flying
             key = hashlib.sha256("".join(trial.id for trial in part).encode()).hexdigest()
             futures.append(client.submit(_fly_part, run, part, key=f"trials-{key}", pure=True))
         for _, outcomes in dask_as_completed(futures, with_results=True):

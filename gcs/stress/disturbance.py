@@ -1,10 +1,10 @@
 """How large a disturbance w = D e breaks the formation in flight: `gcs stress --disturbance`.
 
-The stability radii of the loop as flown (`gains.performance.radii`) say how large the worst one is, and which one it
-is. The vehicles apply it to themselves, from their true errors (`sim_vehicles.motion.sector`). Its size is raised
-around the radius, and growth measured in each flight; the size at which growth passes zero is the onset.
+The stability radii of the loop as flown (`gains.performance.radii`) give the smallest disturbance that breaks it: its
+size and its form. The vehicles apply it to themselves, from their true errors (`sim_vehicles.motion.sector`).
+Flights at sizes around the radius each measure the growth; the size at which growth passes zero is the onset.
 
-The flights are probes, as those of `gcs.stress.free_response`, in which every vehicle has an error at the start.
+The flights are probes as in `gcs.stress.free_response`, but every vehicle has an error at the start.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,10 +33,10 @@ KINDS: tuple[Kind, ...] = "dynamic", "constant"
 _ERROR_M = 5.0
 _PILOT_S = 2.0
 _SIZES = (-1.0, 0.1, 1.0)
-"""Sizes flown in a round, in tolerances from its middle."""
+"""Sizes flown in a round, as distances from its middle in tolerances."""
 _ROUNDS = 6
 _SETTLED_S, _TURNS, _SHORTEST_S, _LONGEST_S = 8.0, 2.0, 20.0, 120.0
-"""A flight lasts until the other motions, filters included, are gone, and for some turns of the one that grows."""
+"""A flight lasts until all other modes, filters included, have decayed, plus some cycles of the growing mode."""
 _MODES = 12
 
 
@@ -45,7 +45,7 @@ class DisturbanceOnset(Published):
 
     kind: Kind
     vehicles: tuple[int, ...]
-    """Whose errors cause it and are disturbed."""
+    """The vehicles whose errors cause the disturbance and are disturbed by it."""
     radius_1_s: float
     frequency_rad_s: float
     onset_1_s: float | None
@@ -67,7 +67,7 @@ class DisturbanceResult(Published):
 
 @dataclass(frozen=True)
 class Case:
-    """One onset to find: the loop of one axis, whose errors are disturbed, and the worst disturbance of them."""
+    """One onset to find: the loop of one axis, whose errors are disturbed, and its worst disturbance."""
 
     kind: Kind
     vehicles: tuple[int, ...]
@@ -75,7 +75,7 @@ class Case:
     worst: Worst
 
     def scenario(self, probe: Scenario, size_1_s: float, *, duration_s: float) -> Scenario:
-        """A probe with the worst disturbance at a size."""
+        """The probe's scenario with the worst disturbance, scaled to this size."""
         count, chosen = self.loop.formation.model.states, list(self.loop.errors)
         whole = np.zeros((count, count))
         whole[np.ix_(chosen, chosen)] = self.worst.direction
@@ -105,11 +105,11 @@ def find_disturbance_onsets(
     counts: Sequence[int] = (),
     ended: Callable[[], None] = lambda: None,
 ) -> DisturbanceResult:
-    """Fly the worst disturbances around the stability radii, of the errors of the first `counts` vehicles.
+    """Fly the worst disturbances at sizes around their stability radii, and locate the onset of each.
 
-    By default these are one follower with the leader, and the whole formation. Relative to the radius, `tolerance` is
-    half the range of the sizes flown in a round, `allowed` the largest distance of an onset from it, and its largest
-    standard error. `ended` is called after each flight. Raises InputError if the scenario's loop has no such radii.
+    Each of `counts` disturbs the first so many vehicles: by default leader and one follower, and all. As shares of the
+    radius, `tolerance` is half the range of sizes in a round, and `allowed` bounds the distance of an onset from the
+    radius and its standard error. Calls `ended` after each flight. Raises InputError if the loop has no such radii.
     """
     probe, delay_s = _probe(plan)
     onsets = tuple(
@@ -124,7 +124,7 @@ def find_disturbance_onsets(
 
 
 def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
-    """How many onsets are too far from the radius, or not known well enough to tell; None if none is."""
+    """The number of onsets that are too far from the radius or too uncertain to tell; None if there are none."""
     off = [o for o in onsets if o.difference is None or abs(o.difference) > allowed]
     rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * o.radius_1_s]
     reasons = (off, "farther than {} from the radius"), (rough, "known less well than to {} of the radius")
@@ -133,7 +133,7 @@ def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
 
 
 def refusal(scenario: Scenario) -> str | None:
-    """Why no disturbance of this scenario is flown, as key, read and wanted; None if it can be."""
+    """Why this scenario cannot be flown with a disturbance, as key, read and wanted; None if it can."""
     control, links = scenario.control, {scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
     wanted = "with --disturbance"
     if len(scenario.vehicles) < 2:
@@ -148,9 +148,9 @@ def refusal(scenario: Scenario) -> str | None:
 
 
 def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, counts: Sequence[int] = ()) -> list[Case]:
-    """The onsets to find at a loop delay (s), of the errors of the first `counts` vehicles.
+    """The onsets to find at a loop delay (s); `counts` as in `find_disturbance_onsets`.
 
-    Raises InputError if gains differ north and east, or couple them.
+    Raises InputError if gains differ between north and east, or couple them.
     """
     narrow = on_one_axis(plan.model, plan.gain)
     if narrow is None:
@@ -168,7 +168,7 @@ def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, co
 
 
 def _probe(plan: FlightPlan) -> tuple[Scenario, float]:
-    """The flight that the disturbance is added to, and its loop delay (s)."""
+    """The scenario to which the disturbance is added, and its loop delay (s)."""
     ids = plan.formation.system_ids
     pilot = fly_plan(replace(plan, scenario=_calm(plan.scenario, _PILOT_S)))
     up, down = plan.scenario.link_of(ids[0])
@@ -200,9 +200,9 @@ def _onset(
         zero = locate_zero([point for point in points if abs(point.varied - middle) <= 1.001 * width])
         if zero is not None and zero.inside:
             break
-        if zero is not None:  # to where growth seems to pass zero, three widths at most
+        if zero is not None:  # move to where growth seems to pass zero, by three widths at most
             middle += float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
-        else:  # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
+        else:  # only the side is known: if growth is above zero everywhere, the onset is at a smaller size
             middle += -2.0 * width if min((point.growth_1_s for point in points), default=0.0) > 0.0 else 2.0 * width
     inside = zero if zero is not None and zero.inside else None
     onset = None if inside is None else inside.varied
@@ -219,7 +219,7 @@ def _onset(
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:
-    """The growth measured in one flight with a disturbance of a size. Empty if nothing was measured."""
+    """Fly a disturbance of this size and measure the growth. Empty if it could not be measured."""
     flight, ids = fly_plan(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)

@@ -20,7 +20,7 @@ SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444
 _RATES = "growth_1_s", "predicted_growth_1_s", "growth_error_1_s"
 _WORST = 6
 _SPARSE = 6
-"""One in so many delays has the continuous model, whose root takes 0.3 s with a dead time."""
+"""Step between the delays at which the continuous model is drawn: with a dead time, its root takes 0.3 s to find."""
 _FLIGHTS = {"own": "from the scenario's start", "probe": "a small error"}
 
 
@@ -29,9 +29,9 @@ def growth_figure(
 ) -> Path | None:
     """Growth rate against loop delay: both models, the flights with their errors, and the residuals below.
 
-    The loop delay expected over the scenario's links is marked: that of the onset's vehicle, or of the slowest. The
-    flights `own`, from the scenario's own initial states, are marked at the lower edge. Returns the file; None, and
-    nothing is drawn, if no flight has a growth rate.
+    A line marks the loop delay expected over the scenario's links: that of the onset's vehicle, or of the slowest. The
+    flights `own`, from the scenario's own initial states, are marked along the lower edge. Returns the file, or None
+    without drawing anything if no flight has a growth rate.
     """
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
     if not probes:
@@ -76,7 +76,7 @@ def growth_figure(
 
 
 def _note(plot: Any, text: str, at: tuple[float, float], color: str, *, ha: str = "left") -> None:
-    """A text at a loop delay and a share of the plot's height."""
+    """Write a text at a loop delay and a fraction of the plot's height."""
     plot.annotate(text, at, xycoords=plot.get_xaxis_transform(), color=color, ha=ha, va="center", fontsize=9)
 
 
@@ -114,7 +114,7 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
 
 
 def _column(outcomes: Sequence[Outcome], name: str) -> FloatArray:
-    """A field of outcomes; NaN for None."""
+    """A field of the outcomes as an array; NaN for None."""
     return np.array([getattr(outcome, name) for outcome in outcomes], dtype=float)
 
 
@@ -141,7 +141,7 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
 
 
 def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The flights that broke soonest, then those that came closest; probes only if there is no own flight."""
+    """The flights that broke soonest, then those with the largest errors; probes only if there are no own trials."""
     flown = [outcome for outcome in outcomes if outcome.trace_m]
     own = [outcome for outcome in flown if outcome.kind == "own"]
 
@@ -150,7 +150,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
         return broke, -float(len(outcome.trace_m)) if broke else 0.0, outcome.spacing_error_max_m or 0.0
 
     ordered = sorted(own or flown, key=badness, reverse=True)
-    # the varied quantity may have no effect: of identical flights only the first is listed
+    # the varied quantity may have no effect: list only the first of identical flights
     apart: dict[tuple[float, ...], Outcome] = {}
     for outcome in ordered:
         apart.setdefault(tuple(outcome.trace_m), outcome)
@@ -158,7 +158,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 
 def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
-    """Mark the verdicts of own-state flights at their loop delays, along the lower edge."""
+    """Mark the verdicts of own trials at their loop delays, along the lower edge."""
     for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
         at = [o.loop_delay_s for o in own if o.verdict == verdict and o.loop_delay_s is not None]
         if at:

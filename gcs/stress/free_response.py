@@ -1,27 +1,27 @@
-"""The free response of one loop in flight: how its errors move after it alone was disturbed.
+"""The free response of one loop in flight: how its errors evolve when only that loop is disturbed.
 
 A *probe* is a flight in which the formation starts exactly in place at its nominal velocity, except for a small error
-of the vehicles of one loop. Nothing acts on the vehicles ahead, so the flight shows the free response of that loop
-alone. Where every vehicle has errors, identical loops along the chain drive each other at resonance (t^k e^{st}), and
-growth can be read only after a long time. A probe removes everything that would mask this response:
+of the vehicles of one loop. The vehicles ahead are undisturbed, so the flight shows the free response of that loop
+alone. If every vehicle had an error, identical loops along the chain would drive each other at resonance (t^k e^{st}),
+and growth could be read only after a long time. A probe removes everything that would mask this response:
 
-* Clock drift, which moves the sampling instants and with them the loop delay. It remains on links that lose or delay
-  at random, where delays vary in any case.
-* Differences between clocks and between links. The station extrapolates states to one instant. It would see errors of
-  up to v T of vehicles that report a velocity but still stand on the launcher, and of half the asymmetry of links. So
-  all vehicles have the same clock and the links of the probed one. Its loop's wait for the control tick is restored by
-  moving less than one period of delay between the up and down links.
-* Changes of the nominal velocity, the noise of sensors, the failsafe, which lossy links would trigger, and the limit on
-  the spacing error: a growing error must be seen for long enough to be measured.
+* Clock drift, which moves the sampling instants and with them the loop delay. It stays on links with random loss or
+  delay, where the loop delay varies in any case.
+* Differences between clocks and between links. The station extrapolates states to one instant, so vehicles that report
+  a velocity while still on the launcher would show errors of up to v T, and asymmetric links half their asymmetry. All
+  vehicles therefore share one clock and the links of the probed vehicle. Moving less than one period of delay between
+  the up and down links restores the probed loop's wait for the control tick.
+* Changes of the nominal velocity, sensor noise, the failsafe, which lossy links would trigger, and the limit on the
+  spacing error, because a growing error must be observed for long enough to be measured.
 * The vehicles' limits: a clipped response is not linear, and random links push vehicles by more than an error of a
-  millimetre. `past_limits` says when. Autopilots keep their limits; their flight counts while it is far from them.
+  millimetre. `past_limits` tells when. Autopilots keep their limits; only the part far from them is used.
 * With autopilots, the offsets between local frames (up to 5 mm each), clocks that jump, and the start from rest: the
   formation hovers in place, where the loop is the same as at any velocity.
 
-On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time. But the loops
+On constant links one flight is enough. Links with random loss or delay push the vehicles all the time. But the loops
 are linear, and the links draw the same delays whatever they carry. So the formation is flown twice with the same seed,
 once in place and once with one loop disturbed. The difference of the two flights is the free response of that loop
-through the drawn delays, exact to the last digit of telemetry.
+under the drawn delays, exact to the last digit of telemetry.
 """
 
 from dataclasses import dataclass, replace
@@ -45,31 +45,31 @@ from scenarios.keys.link import Link
 from scenarios.schema import Limits, NominalVelocity, Safety, Scenario, Vehicle
 
 PROBE_S, _HIDDEN_MODE_S = 20.0, 60.0
-"""How long a probe is flown on constant links; the second with prediction for autopilots. At the longer end of their
-window these break in a mode that an error of position hardly excites and that takes long to outgrow the others."""
+"""Duration of a probe on constant links; the second is for predicted autopilots. At the upper end of their window these
+break in a mode that a position error hardly excites and that takes long to outgrow the others."""
 _RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
-"""On links that lose or delay at random, a probe shows a mean growth rate, whose error falls with the number of loop
-delays flown. It lasts this many loop delays, but at most this long."""
+"""On links with random loss or delay, a probe shows a mean growth rate, whose error falls with the number of loop
+delays flown. The probe lasts this many loop delays, but at most this many seconds."""
 _SPEED_MIN_M_S = 1e-3
 """The kinematics are singular at speed 0."""
 _DIRECTION_NE = np.array([1.0, -0.8])
-"""Direction of a probe's error: not a diagonal, where the modes of gains that couple north and east lie, but near one,
-because two nearly equal modes are hard to separate where both are large."""
+"""Direction of a probe's error: near a diagonal, but not on it. Modes of gains that couple north and east lie on the
+diagonals. Both are excited, but unequally: nearly equal modes are hard to separate if both are large."""
 _LINEAR_SHARE = 0.8
-"""Share of the nominal speed that a velocity error may reach: the linearisation is exact at any speed but zero."""
+"""Largest velocity error as a share of the nominal speed: the linearisation is exact at any speed but zero."""
 LINEAR_COMMAND_M_S2 = 0.9 * LARGEST_COMMAND_M_S2
 _SMALL_M_S = 1.0
-"""Velocity error up to which a law or dynamics of one's own are taken for linear."""
+"""Velocity error up to which a user's own law or dynamics are assumed linear."""
 _LIMIT_SHARE = 0.25
-"""Share of an autopilot's acceleration that a command may reach. The jerk limit and the velocity loop need the rest."""
+"""Largest command as a share of an autopilot's acceleration. The jerk limit and the velocity loop need the rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
-    """The errors of one loop's vehicles as rows of ticks, in order of time, and their flight.
+    """The errors of one loop's vehicles as rows of the tick record, in time order, and the flight they are from.
 
     Until `until_s` after the first row, no limit and no singularity was near. `calm_until_s` is the same for the calm
-    flight of a pair; no disturbed flight can exceed it. `varying` says that the delays vary.
+    flight of a pair, and bounds `until_s`. `varying` says whether the delays vary.
     """
 
     plan: FlightPlan
@@ -80,7 +80,7 @@ class FreeResponse:
     calm_until_s: float = np.inf
 
     def loop_delays_s(self, rows: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
-        """Loop delays in some of the rows: effective ones if the truth is known, else measured medians."""
+        """Loop delay of each vehicle over these rows: effective if the truth is known, else the measured median."""
         if self.flight.truth is None:
             return median_delays_s(rows, system_ids)
         return effective_delays_s(self.plan, rows, self.flight, system_ids)
@@ -91,14 +91,14 @@ def response_alone(
 ) -> FreeResponse:
     """Fly a probe's scenario, see `probe_scenario`."""
     probe = replace(plan, scenario=scenario)
-    # where loop delays differ from command to command, their mean counts: only the truth has it exactly
+    # if loop delays differ between commands, the loop responds to their mean, which only the truth gives exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
     return FreeResponse(probe, flight, errors, linear_until_s(errors, *_linear_range(plan)))
 
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
-    """Fly the formation in place on the scenario's own links: the first flight of a pair."""
+    """Fly the undisturbed formation, in place, on the scenario's own links: the first flight of a pair."""
     return fly_plan(replace(plan, scenario=in_place(plan, (), amplitude=0.0)), folder, with_truth=True)
 
 
@@ -107,12 +107,12 @@ def response_paired(
 ) -> FreeResponse:
     """Fly the second flight of a pair, with an initial error of the given vehicles, and subtract the first, `calm`.
 
-    `amplitude` is that of `in_place`. Rows after the two flights differ in their ticks are left out.
+    `amplitude` is that of `in_place`. Rows are dropped from where the two flights no longer use the same states.
     """
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_plan(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
-    # the leading rows with the same ticks and the same states used: until one of the flights broke
+    # keep the leading rows with the same ticks and the same states used: until one of the flights broke
     count = min(len(rows), len(calm_rows))
     same = [rows[name][:count] == calm_rows[name][:count] for name in ("tick", "system_id", "sample_boot_ms")]
     count = int(np.logical_and.accumulate(np.all(same, axis=0)).sum())
@@ -128,7 +128,7 @@ def response_paired(
 def effective_delays_s(
     plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
 ) -> dict[int, float]:
-    """The constant loop delay that is equivalent to those of each vehicle's commands in these rows."""
+    """For each vehicle, the constant loop delay equivalent to those of its commands in these rows."""
     truth = flight.truth
     assert truth is not None
     whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
@@ -149,7 +149,7 @@ def _linear_range(plan: FlightPlan) -> tuple[float, float]:
 
 
 def linear_error_m_s(scenario: Scenario) -> float:
-    """The velocity error at which a vehicle without autopilot comes near the singularity at speed zero."""
+    """The velocity error beyond which a vehicle without autopilot is too near the singularity at zero speed."""
     return _LINEAR_SHARE * float(np.hypot(*scenario.nominal_velocity_at(0.0)))
 
 
@@ -160,11 +160,11 @@ def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with all vehicles in place at nominal velocity, except for an error of the given ones.
 
-    No vehicle enters its failsafe or meets a limit, and on constant links clocks do not drift. The error is in the
+    No vehicle enters its failsafe or reaches a limit, and on constant links clocks do not drift. The error is in the
     position of a follower (m), and in the velocity of the leader (m/s), whose position is not controlled. It points in
-    `_DIRECTION_NE` and differs from vehicle to vehicle. Vehicles with autopilots begin at rest: their nominal velocity
-    is zero, or the reverse of the leader's error, which disturbs the followers, too; those outside the loop do not act
-    on it.
+    `_DIRECTION_NE` and differs from vehicle to vehicle. Vehicles with autopilots start at rest. Their nominal velocity
+    is zero or, to give the leader an error, the opposite of that error; followers then have the same velocity error,
+    but those outside the leader's loop do not affect it.
     """
     scenario, place, duration_s = plan.scenario.in_steady_flight(), plan.formation.place_ne_m(), PROBE_S
     if scenario.dynamics == "autopilot":
@@ -207,7 +207,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
 
 
 def _at_rest(scenario: Scenario) -> Scenario:
-    """The scenario with autopilots that hover, in frames of one origin and with clocks that do not jump."""
+    """The scenario with hovering autopilots whose local frames share an origin and whose clocks do not jump."""
     still = NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0))
     exact = {"origin_spread_m": 0.0, "clock_jumps": (), "sitl": Sitl()}
     changes = {"nominal_velocity": (still,), "autopilot": scenario.autopilot.model_copy(update=exact)}
@@ -231,10 +231,10 @@ def probe_scenario(
 
 
 def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> tuple[Link, Link]:
-    """The links with delay moved between them, so that telemetry sampled at whole periods waits `waiting_s`.
+    """Move delay between the links until telemetry sampled at whole periods waits `waiting_s` for the control tick.
 
-    The up link then takes a whole number of periods less the waiting, and the sum of both delays is unchanged. On
-    links too short for that, the wait stays as it is, and the down link makes up the difference from `waiting_s`.
+    The up link then takes a whole number of periods minus the wait, and the sum of both delays is unchanged. If the
+    links are too short for that, the wait stays as it is, and the down link makes up the difference from `waiting_s`.
     """
     if up.delay_points or down.delay_points:
         return up, down
@@ -251,9 +251,9 @@ def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> 
 
 
 def linear_until_s(own: TickArray, most_m_s: float, most_m_s2: float) -> float:
-    """Time from the first row until a velocity error or a command is larger than this; infinity if neither ever is.
+    """Time from the first row until a velocity error or a command exceeds its bound; infinity if neither does.
 
-    `own` are rows of the probed vehicles, in order of time.
+    `own` are rows of the probed vehicles, in time order.
     """
     error_m_s, size_m_s2 = _sizes(own)
     beyond = np.flatnonzero((error_m_s > most_m_s) | (size_m_s2 > most_m_s2))
@@ -261,7 +261,7 @@ def linear_until_s(own: TickArray, most_m_s: float, most_m_s2: float) -> float:
 
 
 def past_limits(scenario: Scenario, own: TickArray) -> bool:
-    """Whether vehicles with the scenario's limits could not have flown what these rows show."""
+    """Whether these rows show a motion beyond the scenario's limits."""
     limits = scenario.limits
     if limits == Limits():
         return False

@@ -5,9 +5,9 @@ decides. Here the modes z_k of the flown loop are fitted to the tick record, y[n
 The growth rate is ln|z| / T of the slowest mode, and the delay margin is where it is zero.
 
 Method: ESPRIT (Roy and Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques",
-IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice,
-the second time on y[n] e^{-g n T} with g from the first, so that start and end have equal weight in a motion that
-changes by orders of magnitude.
+IEEE Trans. ASSP 37(7), 1989) on the Hankel matrices of all channels side by side, because the channels share their
+modes. It runs twice, the second time on y[n] e^{-g n T} with g from the first: start and end of a motion that changes
+by orders of magnitude then have equal weight.
 """
 
 from collections.abc import Sequence
@@ -20,24 +20,24 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gcs.control.tick import TickArray, chosen
 
 DECAY_KEPT = 0.02
-"""A motion is followed until it has shrunk to this share of its largest value. Rounding of the telemetry, which the
-loop feeds back and amplifies, is well below that, in real time too."""
+"""A motion is fitted until it has decayed to this share of its largest value. Rounding of the telemetry, which the loop
+feeds back and amplifies, is well below that, in real time too."""
 FEWEST_SAMPLES = 12
 _MOST_SAMPLES = 300
-"""Longer motions are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
+"""Longer motions are decimated: accuracy depends on the length of the window, cost on the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _PARTS = 8
-"""Parts of a window: the scatter of their slopes gives the standard error of the mean growth rate."""
+"""Number of parts of a window. The scatter of their slopes gives the standard error of the mean growth rate."""
 _FEWEST_SIGNS = 3
-"""Fewest changes of sign that give a frequency: one full cycle."""
+"""Fewest sign changes that give a frequency: one full cycle."""
 _LONGEST_HANKEL = 120
 FOLLOWER_MODES = 4
-"""Two states and two late states: enough for a vehicle that does not react to those behind it."""
+"""Two states and two delayed states: enough for a vehicle that does not react to those behind it."""
 _RANK_FLOOR = 1e-9
 _LEAST_SHARE, _MISFITS = (0.03, 0.1), 10.0
-"""A mode counts if it carries more of the motion than so many misfits, but at least the first share and at most the
-second: modes from rounding and clock noise carry less."""
+"""A mode counts if its share of the motion exceeds this many misfits, a threshold that is clipped to these two shares.
+Modes from rounding and clock noise have a smaller share."""
 CHANNELS = (
     "spacing_error_north_m",
     "spacing_error_east_m",
@@ -48,7 +48,7 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Motion:
-    """Errors at equally spaced instants, on the vehicle's clock from the first sample used."""
+    """Errors at equally spaced times, counted on the vehicle's clock from the first sample used."""
 
     time_s: FloatArray
     """(n,)"""
@@ -59,11 +59,11 @@ class Motion:
 
 @dataclass(frozen=True)
 class Growth:
-    """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
+    """Growth rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
-    `error_1_s` is the standard error. For a fitted mode it is the larger of two: the error from the misfit, and half
-    the difference between the rates of the window's two halves. The window is `start_s` to `end_s` of the motion's
-    time. The frequency is None if the motion does not oscillate.
+    `error_1_s` is the standard error. For a fitted mode it is the larger of the error from the misfit and half the
+    difference between the rates of the window's two halves. The window is `start_s` to `end_s` of the motion's
+    time. The frequency is None if the growth is that of an envelope, or if there are too few sign changes.
     """
 
     growth_1_s: float
@@ -75,11 +75,11 @@ class Growth:
 
 
 def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -> Motion:
-    """The errors of some vehicles at the sampling instants of the states used to command them.
+    """The errors of some vehicles at the sampling times of the states used to command them.
 
-    A state that two ticks used (telemetry late or slower than control) counts once. `sample_boot_ms` is exact, so
-    the samples of regular telemetry are equally spaced to the last digit. Otherwise a cubic spline interpolates them at
-    equally spaced instants.
+    A state used by two ticks (telemetry late or slower than control) counts once. `sample_boot_ms` is exact, so the
+    samples of regular telemetry are equally spaced to the last digit. Otherwise a cubic spline interpolates them to
+    equally spaced times.
     """
     columns: list[FloatArray] = []
     for system_id in system_ids:
@@ -99,10 +99,10 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
 
 
 def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: int = FOLLOWER_MODES) -> Growth | None:
-    """The growth rate of a motion from `start_s` on, when faster modes have died away.
+    """The growth rate of a motion by a fit of its modes from `start_s` on, when the faster ones have decayed.
 
-    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. At most `modes` modes are fitted: a loop
-    of several vehicles has more slow ones. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
+    The window ends at `end_s`, or when the motion has decayed to `DECAY_KEPT`. At most `modes` modes are fitted: a loop
+    of several vehicles needs more. None if fewer than `FEWEST_SAMPLES` samples are left or nothing moves.
     """
     time_s, values = _window(motion, start_s, end_s)
     if len(values) < FEWEST_SAMPLES:
@@ -133,7 +133,7 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
     """The growth rate of a motion under varying delays: the slope of the logarithm of its norm over all channels.
 
     Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`. The
-    frequency follows from the changes of sign.
+    frequency is computed from the sign changes.
     """
     time_s, values = _window(motion, start_s, end_s)
     scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
@@ -146,11 +146,11 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
 
 
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
-    """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
+    """The growth rate of a whole formation's errors, sampled every `period_s`: the slope of the log of their envelope.
 
-    For flights without a free response to fit, where random links push the vehicles all the time or many vehicles have
-    large errors at once. The envelope is the largest size within a second; it is followed until it has shrunk to
-    `DECAY_KEPT`, where noise may sustain it.
+    It is for flights without a free response to fit, because random links push the vehicles all the time or many
+    vehicles have large errors at once. The envelope is the largest error within a second. It is fitted until it has
+    decayed to `DECAY_KEPT`, below which noise may sustain it.
     """
     reach = max(1, round(_ENVELOPE_S / period_s))
     if size.size < reach + 1:
@@ -165,9 +165,9 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 
 
 def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
-    """The slope of a logarithm over time, with the standard error of the mean slope of `_PARTS` parts.
+    """The slope of a logarithm over time; its standard error is that of the mean slope of `_PARTS` parts.
 
-    Random delays make the logarithm a random walk with drift. The slopes of its parts are then independent.
+    Random delays make the logarithm a random walk with drift, whose parts have independent slopes.
     """
     parts = min(_PARTS, time_s.size // 2)
     split = zip(np.array_split(time_s, parts), np.array_split(level, parts), strict=True)
@@ -183,7 +183,7 @@ def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
 
 
 def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
-    """The median of the channels' mean frequencies, from their changes of sign; None if no channel has enough."""
+    """The median of the channels' mean frequencies, from their sign changes; None if no channel has enough of them."""
     found: list[float] = []
     for channel in values.T:
         before = np.flatnonzero(channel[:-1] * channel[1:] < 0.0)
@@ -195,7 +195,7 @@ def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
 
 
 def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, FloatArray]:
-    """Instants and values from the start to the end, or until the motion has decayed."""
+    """Times and values from the start to the end, or until the motion has decayed."""
     inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
     values = motion.values[inside]
     values = values[: _count_before_rest(values)]
@@ -203,7 +203,7 @@ def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, F
 
 
 def _count_before_rest(values: FloatArray) -> int:
-    """Number of samples until the motion stays below `DECAY_KEPT` of its largest, averaged over the channels."""
+    """Number of samples until the motion, averaged over the channels, stays below `DECAY_KEPT` of its maximum."""
     if not values.size:
         return 0
     size = (np.abs(values) / np.maximum(np.abs(values).max(axis=0), np.finfo(float).tiny)).mean(axis=1)
@@ -212,7 +212,7 @@ def _count_before_rest(values: FloatArray) -> int:
 
 
 def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[complex, float] | None:
-    """s = ln z / T of the slowest mode that carries a share of the motion, and the standard error of its real part."""
+    """s = ln z / T of the slowest mode that counts (`_LEAST_SHARE`), and the standard error of its real part."""
     if len(values) < FEWEST_SAMPLES or not values.any():
         return None
     time_s = np.arange(len(values)) * period_s
@@ -221,7 +221,7 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
         return None
     slowest = _slowest(first, values)
     trend_1_s = float(np.log(abs(slowest)) / period_s)
-    # relative to the middle of the window, so that the weights do not overflow
+    # relative to the middle of the window, to keep the weights from overflowing
     flattened = values * np.exp(np.clip(-trend_1_s * (time_s - time_s.mean()), -300.0, 300.0))[:, np.newaxis]
     z = _modes(flattened, modes)
     if z is None:
@@ -235,7 +235,7 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
 
 
 def _modes(values: FloatArray, most: int) -> ComplexArray | None:
-    """Modes z shared by all channels, by ESPRIT of order `most` or less."""
+    """The modes z shared by all channels, by ESPRIT of at most order `most`."""
     count = len(values)
     rows = min(count // 2, _LONGEST_HANKEL)
     windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
@@ -260,7 +260,7 @@ def _amplitudes(z: ComplexArray, values: FloatArray) -> tuple[ComplexArray, Comp
 
 
 def _slowest(z: ComplexArray, values: FloatArray) -> complex:
-    """The mode of largest modulus among those that carry a share of the motion."""
+    """The mode of largest modulus among those that count (`_LEAST_SHARE`)."""
     powers, amplitudes = _amplitudes(z, values)
     size = np.linalg.norm(values)
     carried = np.linalg.norm(powers, axis=0) * np.linalg.norm(amplitudes, axis=1) / size
@@ -272,7 +272,7 @@ def _slowest(z: ComplexArray, values: FloatArray) -> complex:
 def _rate_error(z: ComplexArray, mode: complex, values: FloatArray, period_s: float) -> float:
     """The standard error (1/s) of the rate of one of the modes, from the misfit.
 
-    A change of the rate adds a motion t e^{st}; only the part that no change of the amplitudes explains tells the rate.
+    A change of the rate adds a motion t e^{st}. Only the part that no change of amplitude explains determines the rate.
     """
     powers, amplitudes = _amplitudes(z, values)
     misfit = values - (powers @ amplitudes).real
@@ -285,7 +285,7 @@ def _rate_error(z: ComplexArray, mode: complex, values: FloatArray, period_s: fl
 
 @dataclass(frozen=True)
 class GrowthPoint:
-    """One flight near the onset: what was varied, and the growth rate measured.
+    """One flight near the onset: the value of the varied quantity, and the measured growth rate.
 
     `varied` is the loop delay (s), or the size of a disturbance (1/s).
     """
@@ -297,11 +297,11 @@ class GrowthPoint:
 
 @dataclass(frozen=True)
 class Zero:
-    """Where growth rises through zero: `varied`, as of `GrowthPoint`, its standard error and the slope of growth there.
+    """Where growth rises through zero: `varied` as in `GrowthPoint`, its standard error, and the slope of growth there.
 
     `inside` says that there are flights on both sides; otherwise the zero is extrapolated. `misfit` is the distance of
-    the flights from the curve in standard errors: well above one where no parabola fits, as across a kink. The growth
-    of a sampled loop has one where the delay is a whole number of periods.
+    the flights from the curve in standard errors: well above one where no parabola fits, for example across a kink.
+    The growth of a sampled loop has a kink where the delay is a whole number of periods.
     """
 
     varied: float
@@ -312,15 +312,15 @@ class Zero:
 
 
 def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
-    """Where growth is zero, from at least two flights that differ in what was varied.
+    """Where growth rises through zero, from at least two flights at different values of the varied quantity.
 
-    Fits a line, or a parabola to four or more flights, by least squares weighted with the flights' errors. Of several
-    rising zeros it is the one nearest to the flight of least growth. None if growth does not rise with what was varied.
+    Fits a line, or a parabola to four or more flights, by least squares weighted by the flights' errors. Of several
+    rising zeros, returns the one nearest the flight with the smallest growth rate in magnitude. None if there is none.
     """
     if len({round(point.varied, 6) for point in points}) < 2:
         return None
     varied, growth, error = np.array([(p.varied, p.growth_1_s, p.error_1_s) for p in points], dtype=float).T
-    # no error counts as less than a thousandth of the spread of the rates: the curve is not exactly a parabola
+    # errors count as at least a thousandth of the spread of the rates: the curve is not exactly a parabola
     error = np.maximum(error, 1e-3 * float(np.ptp(growth)) + 1e-9)
     middle, half = float(varied.mean()), float(np.ptp(varied)) / 2.0
     x = (varied - middle) / half

@@ -2,8 +2,8 @@
 
 A *probe* measures the growth rate of one loop from its free response, in one flight or in two
 (`gcs.stress.free_response`). An *own* trial flies the scenario's own initial states, large errors included, and gives
-the verdict that `gcs fly` would give. In both the monitor only watches: a trial tests the margin of the designed gains,
-not the actions that keep a flight within it.
+the verdict that `gcs fly` would give. In both, the monitor only watches: a trial tests the margin of the designed
+gains, not the monitor's actions that keep a flight within it.
 """
 
 import time  # noqa: TID251 - how long a trial takes is only reported; nothing flown depends on it
@@ -29,14 +29,14 @@ from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growt
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, plan_of, with_verdict
 
 AMPLITUDES = (1.0, 0.03, 0.001)
-"""Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
+"""Initial errors of a probe in m (m/s for the leader). The next is flown if errors leave the linear range too soon."""
 _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS, _PREDICTED_LOOP_DELAYS = 4.0, 2.0
-"""After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it. A predicted
-loop may be at rest after four."""
+"""After this many loop delays, modes other than the slowest have decayed or are small enough to be fitted with it. The
+second is for predicted loops, which may be at rest after four."""
 _FLYING_LOOP_DELAYS = 1.0
-"""For this many loop delays the station uses states of vehicles on the launcher. Without late feedback, this wait is
-enough."""
+"""For this many loop delays the station uses states of vehicles that are still on the launcher. In a loop without
+delayed feedback, the fit can start after that."""
 _BEGUN_LOOP_DELAYS = 2.0
 """After this many loop delays, no command depends on the start any more."""
 _CALM_SHARE = 0.8
@@ -44,14 +44,14 @@ _CALM_SHARE = 0.8
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
-"""Wanted standard error as a share of the growth rate: the other modes of loops of several vehicles decay slowly."""
+"""Wanted standard error as a share of the growth rate: in loops of several vehicles the other modes decay slowly."""
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
     """Fly a trial and judge it. An exception becomes the outcome's `error`; only a full disk is raised, as OSError.
 
-    With `folder`, the files of its flight are kept there as `gcs fly` leaves them; a probe has one folder for each size
-    of the initial error. In real time files are always written, and deleted again without `folder`.
+    With `folder`, the files of its flight are kept there as `gcs fly` leaves them; a probe has one subfolder for each
+    initial error flown. In real time, files are always written, but deleted again without `folder`.
     """
     began_s = time.perf_counter()
     at = dict(trial.coordinates)
@@ -69,8 +69,8 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 def _needs_pair(trial: Trial) -> bool:
     """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays.
 
-    It does on links that vary, and where the links of other vehicles matter: those of one loop, or all if the link of
-    the probed vehicle alone was slowed.
+    It does on links that vary. It also does if vehicles have different links, and either share a loop or the probed
+    vehicle's link is the one that the campaign varies.
     """
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
     coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
@@ -79,7 +79,7 @@ def _needs_pair(trial: Trial) -> bool:
 
 
 def _is_varied(probe: int, coordinates: Mapping[str, float]) -> bool:
-    """Whether the delay of the probed vehicle's own link is what the campaign varies."""
+    """Whether the campaign varies the delay of the probed vehicle's link alone."""
     return f"delay_{probe}" in coordinates
 
 
@@ -103,9 +103,9 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
-    """Probe one loop in one flight, with the links of the loop that breaks first for all vehicles.
+    """Probe one loop in one flight, with all vehicles on the links of the loop that breaks first.
 
-    That loop may be far down the tree, where vehicles ahead would drive it. The equal loop nearest to the leader is
+    That loop may be far down the tree, where vehicles ahead would drive it. The identical loop nearest to the leader is
     therefore probed in its place, with the links and the wait of the loop that breaks first.
     """
     base = plan_of(trial)
@@ -147,7 +147,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _amplitudes(plan: FlightPlan) -> Sequence[float]:
-    """Initial errors of a probe, in order; a law of one's own or an autopilot may be linear for small ones only."""
+    """Initial errors of a probe, in order. A user's own law or an autopilot may be linear for small ones only."""
     return AMPLITUDES if is_modelled(plan) and plan.scenario.dynamics != "autopilot" else AMPLITUDES[1:]
 
 
@@ -163,9 +163,9 @@ def _with_response(
     *,
     amplitudes: Sequence[float],
 ) -> Outcome:
-    """The outcome with the growth rate of a loop, which represents the critical one.
+    """The outcome with the growth rate of `loop`, which stands in for the critical one.
 
-    The initial error is the first of `amplitudes`, or less if that leaves the linear range too soon.
+    The initial error is the first of `amplitudes` that does not leave the linear range too soon.
     """
     outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
     for amplitude in amplitudes:
@@ -176,7 +176,7 @@ def _with_response(
             outcome = replace(outcome, verdict="unstable" if outcome.growth_1_s > 0.0 else "stable")
         elif outcome.verdict != "aborted":
             outcome = replace(outcome, verdict="unknown")
-        # a flight that never left the linear range has infinity for both
+        # both are infinite if the flights never left the linear range
         if not _left_linear_range_too_soon(outcome) or response.until_s >= _CALM_SHARE * response.calm_until_s:
             break
     return outcome
@@ -185,21 +185,21 @@ def _with_response(
 def _loop_of(
     loops: list[CoupledBlock], loop_delay_s: Mapping[int, float], probe: int, age_s: Mapping[int, float] | None = None
 ) -> CoupledBlock:
-    """The loop of a vehicle, or the one that is predicted to break first."""
+    """The loop of vehicle `probe`, or the one that is predicted to break first."""
     if probe == CRITICAL:
         return critical_block(loops, loop_delay_s, age_s)
     return next(loop for loop in loops if probe in loop.system_ids)
 
 
 def _named_vehicle(loop: CoupledBlock, loop_delay_s: Mapping[int, float], outcome: Outcome) -> int:
-    """The vehicle whose delays are stated for its loop: the one whose link was slowed alone, or the slowest."""
+    """The vehicle whose delays are reported for its loop: the one whose link alone was slowed, or the slowest."""
     if outcome.probe in loop.system_ids and _is_varied(outcome.probe, outcome.coordinates):
         return outcome.probe
     return max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
 
 
 def _is_commanded(rows: TickArray, loop: CoupledBlock) -> bool:
-    """Whether these rows have commands of all vehicles of a loop, without which none of its delays is known."""
+    """Whether these rows have commands for all vehicles of a loop; otherwise none of its delays is known."""
     return bool(np.isin(loop.system_ids, rows["system_id"][rows["commanded"]]).all())
 
 
@@ -214,7 +214,7 @@ def _delays_of(
 
 
 def _ages_s(plan: FlightPlan, rows: TickArray) -> dict[int, float] | None:
-    """The ages of the states at the station, which matter where the vehicles' links differ; else None."""
+    """Median ages of the states at the station; None if all vehicles have the same links, where they do not matter."""
     ids = plan.formation.system_ids
     return median_ages_s(rows, ids) if len({plan.scenario.link_of(own) for own in ids}) > 1 else None
 
@@ -247,7 +247,7 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     if loop.has_late_terms:
         settled = _SETTLED_LOOP_DELAYS if loop.assumed_s is None else _PREDICTED_LOOP_DELAYS
     start_s = settled * delay_s + 2.0 * loop.timing.held_s
-    # one for each state and one for each late state; given gains may differ north and east, or couple them
+    # one mode for each state and each delayed state; given gains may differ between north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))
     motion = motion_of(own, loop.system_ids, period_s=loop.timing.held_s)
     grown = norm_growth if response.varying else partial(fit_growth, modes=modes)
@@ -278,7 +278,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
 
 
 def _left_linear_range_too_soon(outcome: Outcome) -> bool:
-    """Whether a smaller initial error would give a better fit: the errors grew, and the window is too short."""
+    """Whether a smaller initial error would give a better fit: errors grew, and the window of the fit is too short."""
     if outcome.fit_start_s is None or outcome.fit_end_s is None:
         return False
     growth_1_s, early = outcome.growth_1_s, outcome.fit_end_s < free_response.PROBE_S / 2.0

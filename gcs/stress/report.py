@@ -1,4 +1,4 @@
-"""What a campaign found: the record in stress.json, and one HTML page with its figures."""
+"""The result of a campaign: its record in stress.json, and one HTML page with its figures."""
 
 import platform
 import shlex
@@ -54,9 +54,9 @@ class Typical(Published):
 class Noise(Published):
     """How much the machine disturbed flights in real time.
 
-    `lateness` is the time from when a set-point was due until it was handed over. `loop_delay_spread_s` is the 90th
-    percentile of the loop delay minus its median. Of the processor time, the host took away `steal_share`, and all
-    processes together used `busy_share`.
+    `lateness` is the time from when a set-point was due until it had been sent. `loop_delay_spread_s` is the
+    90th percentile of the loop delay minus its median. `steal_share` is the share of the processor time that the host
+    took away, and `busy_share` the share that all processes together used.
     """
 
     flights: int
@@ -68,7 +68,7 @@ class Noise(Published):
 
 
 class Provenance(Published):
-    """What a campaign was flown with; the commit is None outside a checkout."""
+    """The seed, software and machine of a campaign; the commit is None outside a checkout."""
 
     seed: int
     versions: dict[str, str | None]
@@ -90,7 +90,7 @@ class CampaignResult(Published):
     onset_shorter: Onset | None = None
     """Where a loop that is predicted over a fixed delay breaks because the true delay is too short."""
     response: ResponsePart | None = None
-    """How the vehicles respond to set-points, which the margin includes; None if they do so at once."""
+    """How the vehicles respond to set-points, which the margin takes into account; None if they respond at once."""
     onset_missing: str
     onset_missing_as_predicted: bool
     curve_error: float | None
@@ -122,9 +122,9 @@ def result_of(
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
 
     With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, or was predicted
-    and not found. It fails as well if the standard error of an onset is more than this fraction of the margin: such
-    flights do not tell whether the onset is that close. The error is not added to the difference, so an onset that is
-    known this well is judged by what was measured. A sweep of which every trial was aborted fails, too.
+    but not found. It also fails if the standard error of an onset exceeds this fraction of the margin: its flights
+    cannot tell whether the onset is that close. The error is not added to the difference: a sufficiently certain onset
+    is judged by its measured value. A sweep in which every trial was aborted fails, too.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
@@ -171,7 +171,7 @@ def result_of(
 
 
 def _missed(onset: Onset, allowed: float) -> str:
-    """Why an onset is not known to be as close to its margin as is allowed; empty if it is."""
+    """Why an onset is not, or not certainly, as close to its margin as allowed; empty if it is."""
     if onset.difference is None or onset.predicted_s is None:
         return ""
     at, margin = f"the onset is at {onset.loop_delay_s:.5f} s of loop delay", f"the margin {onset.predicted_s:.5f} s"
@@ -183,7 +183,7 @@ def _missed(onset: Onset, allowed: float) -> str:
 
 
 def _nothing_measured(sweep: Sequence[Outcome]) -> str:
-    """That every trial of a sweep was aborted, and why; empty if one was not."""
+    """Says that every trial of a sweep was aborted, and why; empty if one was not."""
     if not sweep or any(outcome.verdict != "aborted" for outcome in sweep):
         return ""
     return f"nothing was measured: all {len(sweep)} trials were aborted, the first: {sweep[0].reason}"
@@ -204,7 +204,7 @@ def _version(name: str) -> str | None:
 
 
 def _commit() -> str | None:
-    """The commit of this checkout, with a + if files have changed since."""
+    """The commit of this checkout, with a + if files have changed since; None outside a checkout."""
     named = ("git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+")
     try:
         return subprocess.run(named, capture_output=True, text=True, check=True).stdout.strip()
@@ -221,7 +221,7 @@ def exact(study: Study, axes: Sequence[Axis]) -> bool:
 def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Sequence[Axis]) -> str:
     """Write stress.json, the figures as PNG files, and report.html with the figures embedded.
 
-    Returns why there are no figures, if a package that draws them is not installed.
+    Returns why there are no figures if a package that draws them is not installed, else an empty string.
     """
     write_whole(folder / RESULT_FILE, result.to_json().encode())
     onset = result.onset

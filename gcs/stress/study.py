@@ -1,4 +1,4 @@
-"""Which trials a campaign flies: over its axes, and in search of the onset."""
+"""The trials that a campaign flies: over its axes, and in search of the onset."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from gcs.stress.growth import GrowthPoint, Zero, locate_zero
 from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, sparse_gain
 
 _BRACKET_LINKS_S = (0.0, 0.05, 0.1, 0.2), (0.4, 0.8, 1.6)
-"""Link delays (s), up plus down, that are flown to find out where errors begin to grow: the second if they do not in
+"""Link delays (s), up plus down, flown to bracket where errors begin to grow: the second group if errors do not grow in
 the first."""
 _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
@@ -27,7 +27,7 @@ _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
 """Half widths of the first and the finest round of an onset search, in tolerances."""
 _LARGEST_ERROR = 0.1
-"""Standard error of an onset, as a share of the prediction, above which none was measured."""
+"""Largest standard error of an onset as a share of the prediction; with a larger one, no onset was measured."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 _AT_ONCE = "the formation breaks without any link delay"
@@ -35,19 +35,19 @@ _AT_ONCE = "the formation breaks without any link delay"
 
 @dataclass(frozen=True)
 class Study:
-    """The trials of a scenario: one plan, whose gains stay the same whatever else varies."""
+    """The trials of a scenario. They all use one plan, whose gains stay the same whatever else varies."""
 
     plan: FlightPlan
     real_time: bool = False
 
     @cached_property
     def window_s(self) -> Window:
-        """The loop delays between which the plan is predicted to be stable; without prediction the first is 0."""
+        """Range of loop delays in which the plan is predicted to be stable; it starts at 0 without prediction."""
         assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
-        """The trial at one point. `seed` is the scenario's, from which clocks, jitter and loss are drawn."""
+        """The trial at one point. `seed` is that of its scenario, from which clocks, jitter and loss are drawn."""
         scenario = at_coordinates(self.plan.scenario, coordinates).model_copy(update={"seed": seed})
         return Trial(
             scenario=scenario,
@@ -61,10 +61,10 @@ class Study:
         )
 
     def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:
-        """The trials of a sweep (one axis) or map (two), with the scenario's seed and those that follow it.
+        """The trials of a sweep (one axis) or map (two), with `seeds` successive seeds from the scenario's on.
 
-        Every point gets a probe and an own trial. In real time, random links leave no free response to probe, since no
-        two flights have the same delays: then only the own trial.
+        Every point gets a probe and an own trial. In real time on random links it gets only the own trial: no two
+        flights have the same delays, so there is no free response to probe.
         """
         points = [dict(zip([a.name for a in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
         constant = all(has_constant_links(at_coordinates(self.plan.scenario, point)) for point in points)
@@ -74,7 +74,7 @@ class Study:
 
 
 _Flights = tuple[Annotated[Outcome, PlainSerializer(lambda outcome: outcome.id)], ...]
-"""Outcomes, which JSON names by their ids."""
+"""Outcomes, which are written to JSON as their ids."""
 
 
 @dataclass(frozen=True)
@@ -82,12 +82,12 @@ class Onset:
     """Where the formation breaks, in flight and in the models.
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
-    down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
-    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
-    `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. None where there is
-    no model: of a law that is not linear, or of dynamics of one's own.
+    down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design
+    or, with prediction, the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
+    `predicted_continuous_s` is the same for the continuous model, minus half a period for the hold. These are None if
+    there is no model, because the law is not linear or the dynamics are the user's own.
 
-    `loop` has the vehicles of the loop that breaks. `vehicle` is the one whose link alone was slowed: all delays are
+    `loop` lists the vehicles of the loop that breaks. `vehicle` is the one whose link alone was slowed: all delays are
     then its own, and `link_delay_left_s` is how much longer its link delay may be than in the scenario. Both are None
     if all links were slowed alike.
     """
@@ -111,7 +111,7 @@ class Onset:
     link_delay_left_s: float | None
     loop: tuple[int, ...]
     own: _Flights
-    """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction, at ± half the mismatch there."""
+    """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction, half the mismatch to either side."""
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
@@ -131,9 +131,9 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. Flights that scatter, as over random
     links, are spread farther until the standard error is a quarter of their range. The search follows the measured
-    growth; the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
-    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. The link
-    of `vehicle` alone is slowed, or all links alike. Raises NoOnset with the reason.
+    growth; the prediction only gives its start. Without a prediction, flights give it (`bracketed`). `shorter` looks
+    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. If
+    `vehicle` is given, its link alone is slowed, else all links alike. Raises NoOnset with the reason.
     """
     slowed = _Slowed(study, vehicle)
     expected_s, way = slowed.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
@@ -159,8 +159,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     for round_number in range(1, _ROUNDS + 1):
         spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
         links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
-        # On random links each flight draws its own delays. With the same draws all rates would have the same error,
-        # which their scatter could not show.
+        # On random links each flight draws its own delays. With the same draws, all rates would have the same error,
+        # and their scatter would not show it.
         trials = [
             slowed.probe(link_s, seed=first_seed + (len(flights) + k if random_links else 0))
             for k, link_s in enumerate(links_s)
@@ -199,7 +199,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
 
 def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:
-    """That waiting alone takes longer than the loop delay of the onset."""
+    """The finding that the wait for the control tick alone is longer than the loop delay of the onset."""
     what = "no link delay is short enough to break the formation" if shorter else _AT_ONCE
     at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
     return NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
@@ -237,7 +237,7 @@ class _Slowed:
 
 
 def _no_limit(slowed: _Slowed, run: Run, *, tolerance: float) -> NoOnset:
-    """Fly a loop that no delay is predicted to break, and say what the flights show."""
+    """Fly a loop that no delay is predicted to break, and report what the flights show."""
     flown = run([slowed.probe(d, seed=slowed.study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
     known = _growth_pairs(flown)
     off = max((abs(measured - predicted) / abs(predicted) for measured, predicted in known), default=np.inf)
@@ -299,7 +299,7 @@ def _found(
     block = next(block for block in blocks if nearest.probed in block.system_ids)
     end, way = (0, -1.0) if shorter else (1, 1.0)
     ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(blocks)]
-    # for the loop that breaks first, test the figure that the station flies by
+    # for the loop that breaks first, test the margin that the station flies by
     own_s = block.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
     continuous_s = block.window_continuous_s()[end] if is_modelled(study.plan) else None
@@ -342,7 +342,7 @@ def _found(
 
 
 def _zero_of(flights: Sequence[Outcome], growth: str, way: float) -> float:
-    """The loop delay (s) at which a growth rate that is predicted for these flights passes zero; NaN if it does not."""
+    """The loop delay (s) at which the growth rate predicted for these flights passes zero; NaN if it does not."""
     known = [(o.loop_delay_s, getattr(o, growth)) for o in flights]
     zero = locate_zero(
         [GrowthPoint(way * at_s, rate, 0.0) for at_s, rate in known if at_s is not None and rate is not None]
@@ -351,7 +351,7 @@ def _zero_of(flights: Sequence[Outcome], growth: str, way: float) -> float:
 
 
 def bracketed(trial_at: Callable[[float], Trial], run: Run) -> tuple[float, float] | str:
-    """The link delays between which errors begin to grow; or why there are none, in one line."""
+    """Fly link delays until two bracket where errors begin to grow; returns these, or one line that says why not."""
     before_s = None
     for links_s in _BRACKET_LINKS_S:
         outcomes = run([trial_at(link_s) for link_s in links_s])

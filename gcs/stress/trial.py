@@ -1,4 +1,4 @@
-"""One trial, a formation flown once, and its outcome: what the flight says about stability.
+"""A trial, one flight of a formation under given conditions, and its outcome: what it says about stability.
 
 Both can be pickled. `gcs.stress.measure` flies trials.
 """
@@ -25,7 +25,7 @@ from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
 CRITICAL = 0
-"""Instead of a system id: probe the loop that is predicted to break first."""
+"""Stands for a system id: probe the loop that is predicted to break first."""
 
 TRACE_PERIOD_S = 0.25
 
@@ -35,7 +35,7 @@ class Trial:
     """Everything a trial depends on, and its `coordinates` in the campaign, which do not affect the flight.
 
     `gain` holds the nonzero entries (row, column, value) of K. `probe` is the system id of a vehicle in the loop to be
-    probed, or `CRITICAL`. `responses` are those that were identified before the campaign, or given.
+    probed, or `CRITICAL`. `responses` were identified before the campaign, or given.
     """
 
     scenario: Scenario
@@ -61,15 +61,15 @@ class Trial:
 class Outcome:
     """The outcome of a trial: one row of the campaign's table. None where a value is unknown or does not apply.
 
-    `verdict` is that of the whole flight for an own trial. For a probe it is the sign of the growth rate; without one,
-    "aborted" if the flight was, else "unknown", also where its errors broke a limit. `probed` is the first vehicle of
-    the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as long for the
-    control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see
-    `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.
+    `verdict` is that of the whole flight for an own trial. For a probe it follows from the sign of the growth rate.
+    A probe without a growth rate is "aborted" if its flight was, else "unknown", even if its errors broke a limit.
+    `probed` is the first vehicle of the measured loop. That loop stands in for the loop of vehicle `critical`, with the
+    same wait for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
+    (see `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.
     `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
-    models' growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a
-    rough figure. `ticks_sha256` is the hash of the tick log in virtual time; the same trial has the same one in any
-    process. `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits; a
+    models' growth rates at `loop_delay_s`. The growth of an own trial is that of the envelope of all spacing errors, a
+    rough figure. `ticks_sha256` is the hash of the tick log in virtual time; it is the same in any process.
+    `past_limits` says that random links alone, without any initial error, push vehicles past the scenario's limits; a
     probe is flown without these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`.
     `error` holds a traceback if the trial failed.
     """
@@ -112,7 +112,7 @@ class Outcome:
 
 
 Run = Callable[[Sequence[Trial]], list[Outcome]]
-"""Returns the outcomes of trials in their order, flying those that are not stored."""
+"""Returns the outcomes of trials in their order; flies those that are not stored."""
 
 
 def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
@@ -121,7 +121,7 @@ def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
 
 
 def plan_of(trial: Trial) -> FlightPlan:
-    """The plan of a trial, before the changes that a probe makes."""
+    """The flight plan of a trial, before the changes that a probe makes."""
     formation = plan_formation(trial.scenario)
     K = np.zeros((formation.model.inputs, formation.model.states))
     for row, column, value in trial.gain:

@@ -29,19 +29,19 @@ from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
 GAINS = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
-"""The gains that all flights of benchmarks are flown with."""
+"""The gains of all benchmark flights."""
 _COLUMN = 10
-"""Vehicles behind one another in a large formation, whose columns follow one leader."""
+"""Vehicles in each column of a large formation; all columns follow one leader."""
 _SPACING_M = 100.0
-_REHEARSED_S = 1.0
 _PARSES = 20
-"""Times that pymavlink parses the frames of a tick after each flight."""
+"""How often pymavlink parses the frames of a tick after each flight."""
+_REHEARSED_S = 1.0
 _FRAMES, _REPEATS = 250, 20
-"""Frames that the codecs are timed with, and how often."""
+"""Number of frames in a timing of the codecs, and of repetitions."""
 
 
 class SigningCost(Published):
-    """Run time of signed over unsigned flights, for the whole and for the station: fastest flights and median."""
+    """Run time of signed over unsigned flights, whole and station alone: ratios of the fastest and of medians."""
 
     time_ratio: float
     time_ratio_p50: float
@@ -50,13 +50,13 @@ class SigningCost(Published):
 
 
 class Benchmark(Published):
-    """How fast flights of a scenario are computed: the figures of the fastest, and the median of the speed.
+    """How fast flights of a scenario are computed: figures of the fastest flight, and the median speed.
 
-    `station_s_per_tick` and `vehicles_s_per_tick` are of flights in which station and vehicles take turns, so that each
-    can be timed; kernels that do both at once fly small formations faster. `core_share` is the share of one processor
-    that the fastest flight had. `pymavlink_parse_s` is the time that pymavlink takes in the same run to parse one
-    LOCAL_POSITION_NED of each vehicle, and `tick_over_parse` is a whole tick of the station over that: a ratio that
-    says on any machine how fast the station is.
+    `station_s_per_tick` and `vehicles_s_per_tick` come from flights in which station and vehicles take turns and are
+    timed separately; kernels that run both at once fly small formations faster. `core_share` is the share of one
+    processor that the fastest flight had. `pymavlink_parse_s` is the time that pymavlink takes in the same run to parse
+    one LOCAL_POSITION_NED of each vehicle. `tick_over_parse` is the time of a whole tick of the station over that: a
+    ratio that tells on any machine how fast the station is.
     """
 
     vehicles: int
@@ -75,7 +75,7 @@ class Benchmark(Published):
 
 
 class RealTimeBenchmark(Grade):
-    """How punctual a flight over UDP was, how loaded the machine, and the errors of the flight's latencies."""
+    """Punctuality of a flight over UDP, load of the machine, and errors of the latencies that the flight measured."""
 
     control: Control
     reason: str
@@ -101,7 +101,7 @@ class Seconds(NamedTuple):
 
 @dataclass
 class _Timed:
-    """Vehicles, with the sum of their own run time."""
+    """Vehicles, with their accumulated run time."""
 
     vehicles: Vehicles
     taken_s: float = 0.0
@@ -138,7 +138,7 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
 def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> Benchmark:
     """Fly `seconds` of a scenario `repeat` times in virtual time.
 
-    With `signed`, unsigned and signed flights alternate, and the result has the cost of signing.
+    With `signed`, unsigned and signed flights alternate, and the result includes the cost of signing.
     """
     _, plan = flight_plan(without_solver(scenario, seconds))
     _flight(replace(plan, scenario=plan.scenario.model_copy(update={"duration_s": _REHEARSED_S})))
@@ -175,7 +175,7 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
 
 
 def start_and_speed(plan: FlightPlan, *, seconds: float) -> tuple[float, float]:
-    """How long a plan's vehicles take to start, in s with the take-off, and the seconds flown in one of run time."""
+    """Time (s) that a plan's vehicles take to start, take-off included, and seconds flown per second of run time."""
     flown = _flight(replace(plan, scenario=plan.scenario.model_copy(update={"duration_s": seconds})))
     period_s = 1.0 / plan.scenario.rates.control_hz
     return flown.ticks * period_s - seconds, period_s / flown.s_per_tick
@@ -217,7 +217,7 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
 
 
 def without_solver(scenario: Scenario, seconds: float) -> Scenario:
-    """The scenario for so many seconds with given gains, whose design needs no solver."""
+    """The scenario, shortened to `seconds` and with given gains, whose design needs no solver."""
     requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
     given = {"method": "inclusion", "gains": GAINS, "blocks": ()}
     control = scenario.control.model_copy(update=requirement | given)
@@ -225,7 +225,7 @@ def without_solver(scenario: Scenario, seconds: float) -> Scenario:
 
 
 def not_plain(scenario: Scenario) -> str | None:
-    """What of a scenario a plain station would not fly; None if nothing."""
+    """The key of the scenario that a plain station cannot fly, with what was read and wanted; None if there is none."""
     for key, read, wanted in (
         ("dynamics", scenario.dynamics, "double_integrator"),
         ("control.loop", scenario.control.loop, "ground"),
@@ -251,7 +251,7 @@ def _flight(plan: FlightPlan, *, timed: bool = False, key: Key | None = None) ->
 
 
 def position_frames(count: int) -> list[bytes]:
-    """One LOCAL_POSITION_NED of each of `count` vehicles in flight; no byte of it is omitted as a trailing zero."""
+    """One LOCAL_POSITION_NED of each of `count` vehicles in flight, at full length: no trailing zeros are cut."""
     states = [(1000 + k, 100.5 * k, -3.25 * k, -1000.0, 91.44, 0.125, -0.5) for k in range(count)]
     position = mavlink.LOCAL_POSITION_NED
     numbered = zip(map(wire_id, ids_of(count)), states, strict=True)
@@ -259,13 +259,13 @@ def position_frames(count: int) -> list[bytes]:
 
 
 def pymavlink_parse_s(frames: Sequence[bytes]) -> float:
-    """The time that pymavlink's parser takes for the frames, each a datagram of its own."""
+    """The time pymavlink's parser takes for the frames, each in its own datagram."""
     parser: Any = dialect.MAVLink(None)
     return _taken_s(lambda: [parser.parse_char(frame) for frame in frames])
 
 
 def decode_s() -> Seconds:
-    """The time to decode one LOCAL_POSITION_NED and verify its checksum: the least of several runs."""
+    """The time to decode one LOCAL_POSITION_NED and verify its checksum: the minimum of several runs."""
     frames, refused = position_frames(_FRAMES), Counter[str]()
     return _least(
         lambda: _taken_s(lambda: [mavlink.decode(frame, refused) for frame in frames]),
@@ -274,7 +274,7 @@ def decode_s() -> Seconds:
 
 
 def encode_s() -> Seconds:
-    """The time to encode one set-point, SET_POSITION_TARGET_LOCAL_NED: the least of several runs."""
+    """The time to encode one set-point, SET_POSITION_TARGET_LOCAL_NED: the minimum of several runs."""
     packer: Any = dialect.MAVLink(None, mavlink.STATION_SYSTEM_ID, mavlink.STATION_COMPONENT_ID)
     return _least(
         lambda: _taken_s(lambda: station_set_points(_FRAMES, key_ms=7)),
@@ -283,7 +283,7 @@ def encode_s() -> Seconds:
 
 
 def station_set_points(count: int, key_ms: int) -> list[bytes]:
-    """Set-points with an acceleration only, by the station, to as many vehicles."""
+    """Acceleration-only set-points to `count` vehicles, encoded by the station."""
     points = np.zeros(count, mavlink.SET_POINT)
     points["type_mask"], points["acceleration_ne_m_s2"] = mavlink.IGNORE_ALL_BUT_ACCELERATION, (0.5, -0.25)
     rows = np.arange(count)
@@ -292,7 +292,7 @@ def station_set_points(count: int, key_ms: int) -> list[bytes]:
 
 
 def pymavlink_set_point(packer: Any, key_ms: int) -> bytes:
-    """The same set-point by pymavlink."""
+    """The same set-point, encoded by pymavlink."""
     numbers = key_ms, 1, 1, dialect.MAV_FRAME_LOCAL_NED, mavlink.IGNORE_ALL_BUT_ACCELERATION
     fields = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.25, 0.0, 0.0, 0.0
     return dialect.MAVLink_set_position_target_local_ned_message(*numbers, *fields).pack(packer)
@@ -305,6 +305,6 @@ def _taken_s(work: Callable[[], object]) -> float:
 
 
 def _least(ours: Callable[[], float], theirs: Callable[[], float]) -> Seconds:
-    """The least time a frame of each, measured in turn, so that a busy machine slows both."""
+    """The minimum time per frame of each. They are measured alternately, so a busy machine slows both."""
     taken = [Seconds(ours(), theirs()) for _ in range(_REPEATS)]
     return Seconds(min(each.ours for each in taken) / _FRAMES, min(each.theirs for each in taken) / _FRAMES)

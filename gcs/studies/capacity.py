@@ -1,9 +1,9 @@
-"""`gcs capacity`: how many vehicles, at which rate, a scenario's links carry before the margin is gone.
+"""`gcs capacity`: how many vehicles a scenario's links carry at each rate before the margin is used up.
 
 For each rate, growing formations fly in virtual time over the scenario's own links and channels, until the loop delay
 exceeds the margin of the gains designed for that rate, or the formation no longer flies. Losses are random, so each
-formation flies with several seeds, and is carried only if it holds with all of them. In a folder each flight is stored
-as soon as it ends, so that a study can be resumed.
+formation flies with several seeds, and counts as carried only if it holds with all of them. With a folder, each flight
+is stored as soon as it ends, and a study can be resumed.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ LOADS_FILE, RESULT_FILE = "loads.jsonl", "capacity.json"
 _START_ERROR_M = 2.0
 """Initial displacement of every second vehicle to the east."""
 _DECAYED = 0.1
-"""A formation under control has reduced its errors to this share by the last third of a flight."""
+"""By the last third of a flight, a formation under control has reduced its errors to this share."""
 FEWEST = 2
 SECONDS = 180.0
 """Duration of each flight."""
@@ -40,7 +40,7 @@ SECONDS = 180.0
 
 @dataclass(frozen=True)
 class Load:
-    """One flight of a formation at a rate, and what was left of its margin."""
+    """One flight of a formation at a rate, and the headroom left in it."""
 
     rate_hz: float
     vehicles: int
@@ -49,24 +49,24 @@ class Load:
     loop_delay_p50_s: float | None
     loop_delay_p99_s: float | None
     headroom_p01: float | None
-    """Least headroom, 1 − loop delay / margin, of all but the worst hundredth of the ticks."""
+    """First percentile of the headroom, 1 − loop delay / margin, over the ticks."""
     station_bytes_s: float
-    """MAVLink bytes per second that the station sends and receives, summed."""
+    """MAVLink bytes per second that the station sends and receives, added."""
     lost_up: float
-    """True fraction of the datagrams from vehicles that the links lost; `lost_down` is that of those to vehicles."""
+    """True fraction of the datagrams from vehicles that the links lost; `lost_down` is the same to vehicles."""
     lost_down: float
     error_end_m: float
     """Largest spacing error of all vehicles: the median over the last third of the flight, because one lost set-point
     affects it for seconds."""
     reason: str
-    """What became of the errors, or why the flight ended early."""
+    """What the flight showed: that the margin was gone, the final error, or why it ended early."""
     holds: bool
     """Errors fell to a tenth of their initial size, and 99 of 100 ticks had headroom."""
 
 
 @dataclass(frozen=True)
 class Capacity:
-    """The largest formation carried at one rate, and the smallest tried that was not; None if there is none."""
+    """The largest formation carried at one rate, and the smallest one tried that was not; None if there is none."""
 
     rate_hz: float
     most: Load | None
@@ -76,7 +76,7 @@ class Capacity:
 
 @dataclass
 class _Counted:
-    """Vehicles behind links, with the station's bytes counted."""
+    """Vehicles behind links, with a count of the bytes that the station exchanges with them."""
 
     vehicles: Vehicles
     bytes_both_ways: int = 0
@@ -97,11 +97,11 @@ def capacity(
     store: Store[Load] | None = None,
     ended: Callable[[int], None] = lambda _: None,
 ) -> list[Capacity]:
-    """The capacity at each rate, up to `most` vehicles: the size doubles until one fails, then bisection.
+    """Find the capacity at each rate, up to `most` vehicles: double the size until one fails, then bisect.
 
-    Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
-    decay slowly near the margin. Those in `store` are not flown again, the others are added to it; `ended` is called
-    after each formation with the greatest number still to come. Raises InputError if the scenario is `unflyable`.
+    Each formation flies with `seeds` successive seeds from the scenario's on. Flights last `seconds`, a long time
+    because errors decay slowly near the margin. Those in `store` are not flown again; the others are added to it.
+    `ended` is called after each formation with the maximum number left. Raises InputError if `unflyable`.
     """
     if fault := unflyable(scenario, most, seconds):
         raise InputError(f"{scenario.name}: {fault}")
@@ -123,9 +123,9 @@ def capacity(
 
 
 def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | None:
-    """The fault of a scenario of gains for its own formation only, of vehicles that take off first, or that cannot fly.
+    """Why formations of up to `most` vehicles cannot be flown with this scenario; None if they can.
 
-    None if formations of up to `most` vehicles can be flown.
+    They cannot if its gains fit only its own formation, its vehicles take off first, or its start or links are refused.
     """
     if blocks := len(scenario.control.blocks):
         return f"control.blocks: read {blocks} of them, wanted gains for any number of vehicles"
@@ -137,12 +137,12 @@ def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | 
 
 
 def formations_at_most(rates: int, most: int) -> int:
-    """The greatest number of formations that a study of so many rates flies, up to `most` vehicles."""
+    """The maximum number of formations that a study of so many rates flies, up to `most` vehicles."""
     return rates * _at_most(FEWEST - 1, FEWEST, None, most)
 
 
 def _at_most(low: int, count: int, beyond: Load | None, most: int) -> int:
-    """The greatest number of formations that a search may still fly, from `count` vehicles on."""
+    """The maximum number of formations that a search may still fly, from `count` vehicles on."""
     if count <= low:
         return 0
     doublings = 0 if beyond is not None else ceil(log2(most / count)) + 1
@@ -150,7 +150,7 @@ def _at_most(low: int, count: int, beyond: Load | None, most: int) -> int:
 
 
 def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, store: Store[Load] | None = None) -> Load:
-    """The first flight that does not hold; if all do, the one of least headroom."""
+    """Fly each seed until a flight does not hold, and return that one; if all hold, the one with the least headroom."""
     loads: list[Load] = []
     for seed in range(scenario.seed, scenario.seed + seeds):
         load = None if store is None else store.flown.get((rate_hz, vehicles, seed))
@@ -167,7 +167,7 @@ def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, st
 def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
     """Fly this many vehicles with telemetry and control at the rate, and measure.
 
-    Raises GainsError if no gains meet the scenario's requirement at this rate, or the given ones are unstable at it.
+    Raises GainsError if no gains meet the scenario's requirement at this rate, or given gains are unstable at it.
     """
     formed = with_vehicles(_at_rate(scenario.with_calm_monitor(), rate_hz), vehicles)
     _, plan = flight_plan(_displaced(formed))
@@ -201,7 +201,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
 def _at_rate(scenario: Scenario, rate_hz: float) -> Scenario:
     """The scenario with telemetry and control at this rate.
 
-    Sensor and loop on board run at the least multiples of it that are no slower than the scenario's own.
+    Sensor and loop on board run at the lowest multiples of it that are no slower than the scenario's own rates.
     """
     rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
     if scenario.control.loop != "onboard":
@@ -243,9 +243,9 @@ def _displaced(scenario: Scenario) -> Scenario:
 
 
 def loads_of(folder: Path, scenario: Scenario, *, resume: bool) -> Store[Load]:
-    """The finished flights of a study's folder, by rate, vehicles and seed.
+    """The store of finished flights in a study's folder, by rate, vehicles and seed.
 
-    Raises InputError if the folder is to be resumed and holds no study of this scenario.
+    Raises InputError if `resume` is set and the folder holds no study of this scenario.
     """
     if resume:
         check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))

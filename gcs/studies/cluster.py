@@ -1,4 +1,4 @@
-"""A map of trials on Dask with one local worker and with several: what distribution costs, and how far it goes."""
+"""A map of trials on Dask with one local worker and with several: the cost of distribution, and how far it scales."""
 
 import pickle
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
@@ -25,10 +25,10 @@ class ClusterMap(Published):
     """A map flown by one local worker and by all; each worker is a process with one thread.
 
     `efficiency` is the time with one worker over `workers` times the time with all. `trial_s` is the mean run time of a
-    trial with one worker, and `worker_overhead_s` what that worker took beside it, for each trial. `central_s` is the
-    processor time of scheduler and client for each trial, from a map of trials that are not flown. Both are one Python
-    process here, which no number of workers makes faster. `cores_served` is `trial_s` / `central_s`, the number of
-    workers that would keep it busy all the time. Sizes are those of pickled trials and outcomes.
+    trial with one worker, and `worker_overhead_s` the additional time per trial that this worker took. `central_s` is
+    the processor time of scheduler and client per trial, from a map of trials that are not flown. Scheduler and client
+    are one Python process here, which more workers do not speed up. `cores_served` is `trial_s` / `central_s`, the
+    number of workers that would keep this process fully busy. Sizes are those of pickled trials and outcomes.
     """
 
     trials: int
@@ -46,13 +46,13 @@ class ClusterMap(Published):
 
 
 _TRACE = 120
-"""Values in the trace of a flight of 30 s."""
+"""Number of values in the trace of a flight of 30 s."""
 _UNFLOWN = 500
-"""Trials of the map from which the cost of scheduler and client is found."""
+"""Number of trials in the map that measures the cost of scheduler and client."""
 
 
 class _Flown(NamedTuple):
-    """The outcomes of a map, the time it took, and the processor time of this process for a trial not flown."""
+    """The outcomes of a map, the time it took, and this process's processor time per trial that is not flown."""
 
     outcomes: list[Outcome]
     taken_s: float
@@ -60,7 +60,7 @@ class _Flown(NamedTuple):
 
 
 def map_on_cluster(scenario: Scenario, *, trials: int, workers: int, seconds: float) -> ClusterMap:
-    """Fly a map over link delay and jitter by one worker and by `workers`; each trial flies for `seconds`.
+    """Fly a map over link delay and jitter with one worker and with `workers`; each trial flies for `seconds`.
 
     Raises InputError if `distributed` is not installed.
     """
@@ -92,13 +92,13 @@ def map_on_cluster(scenario: Scenario, *, trials: int, workers: int, seconds: fl
 
 
 def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
-    """Fly trials by so many workers, which have started with a map of others that they do not fly."""
+    """Fly the trials `wanted` on this many workers, after a map of the trials `unflown`, which are not flown."""
     try:
         from distributed import LocalCluster
     except ImportError:
         raise InputError("--cluster: the package distributed is not installed, wanted the extra [cluster]") from None
-    make: Any = LocalCluster  # its types allow no cluster that is there at once
-    # without a port its HTTP server, which also runs without a dashboard, takes 8787, and warns if that is in use
+    make: Any = LocalCluster  # its type hints do not allow synchronous use
+    # its HTTP server runs even without a dashboard; without an explicit port it takes 8787, and warns if that is in use
     http = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
     with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", scheduler_kwargs=http) as cluster:
         with dask_workers(cluster.scheduler_address, _not_flown) as answer:

@@ -38,12 +38,12 @@ METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
 REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
 _FLOOR = 1e-3
-"""Smaller values are rounding of the telemetry."""
+"""Lower end of the figure's axes: smaller values are rounding of the telemetry."""
 
 
 @dataclass(frozen=True)
 class Route:
-    """The figures of one route; None where there is none, with the reason in `failed`."""
+    """The figures of one route; None where a figure is not available. `failed` says why the design failed."""
 
     method: Method
     failed: str = ""
@@ -62,19 +62,19 @@ class Route:
     delay_margin_continuous_s: float | None = None
     decay_rate_1_s: float | None = None
     string_peak: float | None = None
-    """Largest growth of a spacing error from one follower to the next, over all frequencies, when the leader is
-    disturbed, without delay."""
+    """Largest amplification of a spacing error from one follower to the next over all frequencies, when the leader is
+    disturbed and there is no delay."""
     links: int | None = None
-    """Pairs of vehicles in which one uses the other's errors."""
+    """Ordered pairs of vehicles in which the first uses errors of the second."""
     numbers_used: int | None = None
-    """Total number of other vehicles' errors that vehicles use."""
+    """Number of other vehicles' errors that a vehicle uses, added over all vehicles."""
 
 
 Flights = dict[Method, TickArray]
 
 
 def compare(scenario: Scenario, *, ended: Callable[[int], None] = lambda _: None) -> tuple[list[Route], Flights]:
-    """Design and fly the scenario by every route; `ended` is called after each with the number still to come."""
+    """Design and fly the scenario by every route; `ended` is called after each with the number left."""
     routes: list[Route] = []
     flights: Flights = {}
     for left, method in zip(reversed(range(len(METHODS))), METHODS, strict=True):
@@ -135,15 +135,15 @@ def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
         error = np.stack([own["spacing_error_north_m"], own["spacing_error_east_m"]], axis=1)
         error = error[np.isfinite(error).all(axis=1)]
         first = float(np.linalg.norm(error[0])) if len(error) else 0.0
-        if first > 0.1:  # smaller ones are noise at the start
+        if first > 0.1:  # smaller initial errors are noise
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
 
 
 def string_peak(model: FormationModel, K: FloatArray) -> float | None:
-    """Largest |E_i / E_j| over frequencies for a follower i behind a follower j, the leader's command disturbed.
+    """Largest |E_i / E_j| over frequencies, for a follower i of a follower j, with the leader's command disturbed.
 
-    None without two followers in a row. Uses the search of `gains.performance.string_stability`.
+    None if no follower follows another. Uses the search of `gains.performance.string_stability`.
     """
     single = FormationModel(model.predecessors, axes=1)
     narrow = K[:: model.axes, :: model.axes]
@@ -185,7 +185,7 @@ def write_comparison(
 
 
 def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
-    """The rows of the table: what is compared, and the figure of each route."""
+    """The rows of the table: the name of a figure, and its value for each route."""
 
     def margin(route: Route, margin_s: float | None) -> str:
         return "no limit" if margin_s is None and not route.failed else ms_text(margin_s, unit="")
@@ -210,7 +210,7 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
 
 
 def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
-    """A figure of the largest spacing error and the largest command of all vehicles over time, for each route."""
+    """Draw the largest spacing error and the largest command of all vehicles over time, for each route."""
     figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
     for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
         flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]
@@ -231,7 +231,7 @@ def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
 
 
 def sizes_figure(file: Path, grown: list[DesignCost]) -> Path:
-    """Design time against the number of vehicles in a chain."""
+    """Draw the design time against the number of vehicles in a chain."""
     figure, (plot,) = figure_of(1, (9.0, 3.8))
     labels = list(dict.fromkeys(size.method for size in grown))
     for label, colour in zip(labels, _COLOURS, strict=False):

@@ -1,4 +1,4 @@
-"""The cost of a design as the formation grows: its time and free gains, for all routes and for centralised designs."""
+"""The cost of a design as the formation grows: time and free gains, by all routes and by centralised methods."""
 
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable
@@ -21,7 +21,7 @@ RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
-"""A method is not tried on a size that would take it longer than this, if its time grows with the cube of the size."""
+"""A method is not tried on a size that would take longer than this if its time grows with the cube of the size."""
 _DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5
@@ -42,11 +42,11 @@ class DesignCost:
 
 
 def design_costs(ended: Callable[[int], None] = lambda _: None) -> list[DesignCost]:
-    """Costs for chains of growing length; times of quick designs are medians of several.
+    """Costs of designs for chains of growing length; times of quick designs are medians of several.
 
-    The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs
-    have no margin to meet: the LQR solves one Riccati equation, the LMI one semidefinite programme. `ended` is called
-    after each method with the number still to come.
+    The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs need not
+    meet a margin: the LQR solves one Riccati equation, the LMI one semidefinite programme. `ended` is called after each
+    method with the number left.
     """
     found: list[DesignCost] = []
     _inclusion(3)  # imports at first use are not part of a design
@@ -63,7 +63,7 @@ def design_costs(ended: Callable[[int], None] = lambda _: None) -> list[DesignCo
 
 
 def ratios(costs: list[DesignCost]) -> list[float]:
-    """Time of each design over that of inclusion for five vehicles in the same run; empty for no designs."""
+    """Time of each design over that of inclusion for five vehicles in the same run; empty without designs."""
     reference_s = [cost.design_s for cost in costs if (cost.method, cost.vehicles) == _REFERENCE]
     return [cost.design_s / reference_s[0] for cost in costs]
 
@@ -118,7 +118,7 @@ def _centralised_lqr(vehicles: int) -> int:
 
 
 def _centralised_lmi(vehicles: int) -> int:
-    # one axis: the two are independent, and both at once would have four times the unknowns for the same gains
+    # one axis: the two axes are independent, and both together would have four times the unknowns for the same gains
     plant = formation_plant(_chain(vehicles, axes=1))
     return centralised_lmi(plant, gain_bound=_GAIN_BOUND, lyapunov_bound=_GAIN_BOUND).K.size
 

@@ -1,10 +1,10 @@
-"""`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction.
+"""`gcs design --front` and `--at`: the best gains at a loop delay, by every route, with and without prediction.
 
-`--compare-prediction`: the loop delay that gains take with prediction, against any without it. Slow gains take a long
-delay, so delays are compared at equal decay: the longest at which any static gains decay as fast as those of the
-scenario do with prediction, and the longest over which a station can predict with any gains that decay as fast, or with
-the scenario's where vehicles respond with a lag, stable at every constant delay within a share of it. The string peak
-of the static gains is no smaller; with a response it is larger.
+`--compare-prediction`: how much more loop delay prediction allows. Slow gains take a long delay, so delays are compared
+at equal decay, that of the scenario's gains with prediction. Without prediction it is the longest delay at which any
+static gains decay as fast. With prediction it is the longest that can be assumed and leaves the loop stable at every
+constant delay within a share of it, with any gains that decay as fast (only the scenario's own if vehicles respond with
+a lag). The string peak of the static gains is no smaller; with a response it is larger.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,13 +36,13 @@ from scenarios.schema import FixedGains, Scenario
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr")
 DELAYS_S = 0.1, 0.3, 0.6, 1.5
 MOST_VEHICLES = 12
-"""The figures are those of the whole formation; of larger ones they take minutes."""
+"""The figures are computed for the whole formation, which takes minutes for larger ones."""
 Prediction = Literal["on", "off"]
 TOLERATED = 0.2, 0.1, 0.05, 0.03
-"""Shares of the delay by which a comparison asks the true delay to differ from the assumed one."""
-# that by which the scenario's own gains are asked, too
+"""Shares of the delay by which the true delay may differ from the assumed one, each compared."""
+# the share at which the scenario's own gains are compared, too
 _OWN_TOLERATED = 0.05
-# k2 as a share of k1 of all other gains; neither decay nor stability depends on it
+# k2 as a share of k1 in all other gains; neither decay nor stability depends on it
 _FRONT_SHARE = 0.2
 _COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
 _FIGURES = {
@@ -56,7 +56,7 @@ _AIM_NAMES: dict[Aim, str] = {"alpha_at_delay": "alpha", "decay_rate_at_delay_1_
 
 
 class FrontFields(Published):
-    """A front, as --json prints it."""
+    """A front as --json prints it."""
 
     scenario: str
     tolerated: float
@@ -72,8 +72,7 @@ def front(
     workers: int = 1,
     ended: Callable[[int], None] = lambda _: None,
 ) -> FrontFields:
-    """The front at these delays (s); `ended` is called after each point with the number still to come.
-    `workers` is the number of processes.
+    """The front at these delays (s), by `workers` processes; `ended` is called after each point with the number left.
 
     Raises InputError where a front is not defined.
     """
@@ -96,7 +95,7 @@ def front(
 
 
 def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
-    """The search of a scenario's formation by these methods. Raises InputError where a front is not defined."""
+    """The search for a scenario's front by these methods. Raises InputError where a front is not defined."""
     response, dynamics = given_response(scenario), scenario.dynamics
     for read, given, wanted in (
         ("loop onboard", scenario.control.loop == "onboard", "loop ground"),
@@ -122,7 +121,7 @@ def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
 def point_at(
     scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
 ) -> tuple[Scenario, GainsAtDelay]:
-    """The scenario with the gains of a point of the front; with or without prediction, or else the better of both.
+    """The scenario with the gains of a point of the front; prediction None takes the better of with and without.
 
     Raises InputError if no gains take the delay.
     """
@@ -142,13 +141,13 @@ def point_at(
 
 
 def _inclusion(point: FrontPoint) -> tuple[float, float, float]:
-    """K1, K2 and K3 of a gain by inclusion; a leader alone has K1 only."""
+    """K1, K2 and K3 of a gain by inclusion; a lone leader has only K1."""
     K = point.K
     return (float(K[0, 0]), 0.0, 1.0) if len(K) == 1 else (float(K[1, 2]), float(K[1, 0]), float(K[1, 1]))
 
 
 def fields_of(found: FrontPoint | Refusal) -> GainsAtDelay:
-    """A point as it is printed, or why there is none."""
+    """The printed fields of a point, or of the reason why there is none."""
     method, prediction, aim = found.route
     named = {"method": method, "prediction": prediction, "maximised": _AIM_NAMES[aim], "loop_delay_s": found.delay_s}
     if isinstance(found, Refusal):
@@ -158,14 +157,14 @@ def fields_of(found: FrontPoint | Refusal) -> GainsAtDelay:
 
 
 class Comparison(Published):
-    """What prediction is worth at the decay of a scenario's gains, and what it costs."""
+    """The worth and the cost of prediction at the decay of a scenario's gains."""
 
     scenario: str
     ways: tuple[GainsAtDelay, ...]
 
 
 def compared(design: Design, name: str) -> Comparison:
-    """The comparison at the decay of a design. Raises InputError if it is not one by inclusion of stable gains."""
+    """The comparison at the decay of a design. Raises InputError unless it is by inclusion and its gains are stable."""
     answers = set(design.responses.values())
     if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
@@ -192,7 +191,7 @@ def compared(design: Design, name: str) -> Comparison:
         return found.model_copy(update=whose | {"decay_rate_half_way_1_s": half_way_1_s})
 
     predicted = [("own", own, share) for share in (TOLERATED if response else (_OWN_TOLERATED,))]
-    if response is None:  # none that decay as fast tolerate more than these
+    if response is None:  # no other gains that decay as fast tolerate more than these
         k1, k3 = least_gains(wanted_1_s, period_s)
         least = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
         predicted = [*(("least", least, share) for share in TOLERATED), *predicted]
@@ -201,7 +200,7 @@ def compared(design: Design, name: str) -> Comparison:
 
 
 def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
-    """Draw one figure of a front's points over the loop delay into matplotlib's `axes`, which are returned.
+    """Draw one figure of a front's points over the loop delay into matplotlib's `axes`, and return them.
 
     `figure` is `alpha`, `decay_rate_1_s`, `string_peak`, `spacing_gain_s2` or `noise_gain`.
     """
@@ -224,7 +223,7 @@ def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
 
 
 def picture(found: FrontFields, file: Path) -> Path:
-    """Draw a front: figures of its points over the loop delay, as PNG, SVG or PDF by the name of the file."""
+    """Draw a front, figures of its points over the loop delay, as PNG, SVG or PDF by the extension of the file."""
     figure, plots = figure_of(2, (10.0, 7.0), (1.0, 1.0), columns=2)
     for plot, name in zip(plots.flat, _FIGURES, strict=False):
         plot_front(found, name, plot)

@@ -1,7 +1,7 @@
-"""`gcs identify`: how a scenario's vehicles respond to accelerations, from a flight of one of them in virtual time.
+"""`gcs identify`: how a scenario's vehicles respond to accelerations, from flights of one of them in virtual time.
 
-The leader flies alone, without delay and undisturbed. Its nominal velocity jumps to and fro, along its course and then
-across it, and a weak loop follows. The models of `gcs.autopilot.identify` are fitted to commands and velocities.
+For each axis, the leader flies alone, without delay and undisturbed. Its nominal velocity jumps along or across its
+course, and a weak loop follows it. The models of `gcs.autopilot.identify` are fitted to commands and velocities.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from scenarios.schema import Clocks, Control, FixedGains, Limits, Links, Nominal
 _AXES = "along", "across"
 _LEAST = 0.001
 _WHERE_RAD_S = 1.0
-"""The slower axis is the one that lags more at this frequency."""
+"""Frequency of comparison: the slower axis is the one that lags more here."""
 _GAINS = FixedGains(K1=-0.5, K2=0.0, K3=0.1)
 _JUMPS, _JUMP_S = (1, -1, -1, 1, 1, -1, 1, 0), 4.0
 _JUMP_M_S = 0.5
@@ -32,7 +32,7 @@ _JUMP_M_S = 0.5
 def responses_of(scenario: Scenario) -> Mapping[str, Identified]:
     """The responses along the course and across it.
 
-    InputError if the vehicle does not fly to the end, or if no model explains its velocity.
+    Raises InputError if the vehicle does not fly to the end, or if no model explains its velocity.
     """
     if scenario.dynamics in BUILT_IN:
         wanted = "jsbsim, or dynamics in a Python file: double integrators respond at once, autopilots are identified"
@@ -87,7 +87,7 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
 
 
 def as_toml(found: Mapping[str, Identified]) -> str:
-    """What was identified, as comments, and the response of the slower axis as part of a scenario."""
+    """The results as TOML comments, followed by the response of the slower axis as a table of a scenario."""
     slower = min(found, key=lambda axis: float(np.angle(found[axis].response.transfer(np.array(_WHERE_RAD_S)))))
     values = {name: round(value, 3) for name, value in asdict(found[slower].response).items() if value}
     lines = [

@@ -1,4 +1,4 @@
-"""The table of `gcs bench --peers`: one row for each figure, and the peers that are not installed or failed."""
+"""The table of `gcs bench --peers`: a row for each figure, and a list of peers that are not installed or failed."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from scenarios.schema import Scenario
 SIZES = (5, 20, 100)
 SCRIPTS = Path(__file__).parents[2] / "examples" / "peers"
 _PATIENCE_S = 60.0
-"""How long a script may take beside its flight."""
+"""Time that a script may take in addition to its flight."""
 _OURS = "this station"
 _STATIONS = {_OURS: "own_station", "pymavlink": "pymavlink_station", "MAVSDK": "mavsdk_station"}
 _PACKAGES = {
@@ -46,11 +46,11 @@ _MARGINS = 20
 
 
 class PeerError(Exception):
-    """A peer did not do what it was started for; the text is one line."""
+    """A peer failed at its task; the text is one line."""
 
 
 class Row(Published):
-    """A figure of the same work; `ratio` is `theirs` over `ours`, None if that is 0."""
+    """A figure of the same work by both; `ratio` is `theirs` over `ours`, None if `ours` is 0."""
 
     peer: str
     work: str
@@ -61,7 +61,7 @@ class Row(Published):
 
 
 class Skipped(Published):
-    """A peer that is not compared with, in all or in one work."""
+    """A peer that is left out of the whole comparison or of one task, and why."""
 
     peer: str
     why: str
@@ -80,7 +80,7 @@ def side_by_side(
 ) -> SideBySide:
     """Compare with every peer that is installed; stations fly formations of `sizes` for `seconds` each.
 
-    `ended` is called after each part with the number of parts still to come.
+    `ended` is called after each part with the number of parts left.
     """
     absent = [peer for peer, package in _PACKAGES.items() if find_spec(package) is None]
     skipped = [Skipped(peer=peer, why="not installed: python3 make.py peers") for peer in absent]
@@ -117,7 +117,7 @@ def _codecs() -> Iterator[Row]:
 def _closed_loops(
     scenario: Scenario, vehicles: int, seconds: float, absent: Sequence[str], skipped: list[Skipped]
 ) -> Iterator[Row]:
-    """Fly the same formation with this station and with each plain one; those that fail are added to `skipped`."""
+    """Fly the same formation with this station and with each peer's; those that fail are added to `skipped`."""
     flown: dict[str, dict[str, tuple[float, str]]] = {}
     for peer, script in _STATIONS.items():
         if peer not in absent:
@@ -167,9 +167,9 @@ def _growth(peer: str) -> Iterator[Row]:
 
 
 def _fly_closed_loop(script: str, scenario: Scenario, vehicles: int, seconds: float) -> dict[str, tuple[float, str]]:
-    """Fly `seconds` of so many vehicles by the station of a script: figures with their units, by name.
+    """Fly this many vehicles for `seconds` with the station of a script; returns figures with their units, by name.
 
-    Lateness is from when a tick was due until all its set-points were sent. Raises PeerError if it does not fly them.
+    Lateness is from when a tick was due until all its set-points were sent. Raises PeerError if the script fails.
     """
     flown = without_solver(with_vehicles(scenario, vehicles), seconds)
     with tempfile.TemporaryDirectory(prefix="peers-") as name:
@@ -191,7 +191,7 @@ def _fly_closed_loop(script: str, scenario: Scenario, vehicles: int, seconds: fl
 
 
 def run_script(script: str, *arguments: str, folder: Path, patience_s: float = _PATIENCE_S) -> dict[str, float]:
-    """The figures that a script leaves in a file of the folder, its last argument."""
+    """Run a script, and return the figures that it writes to the file named by its last argument."""
     out = folder / "figures.json"
     command = [sys.executable, str(SCRIPTS / f"{script}.py"), *arguments, str(out)]
     try:

@@ -1,7 +1,7 @@
-"""`gcs thesis`: the figures and numbers of the source as printed and as computed.
+"""`gcs thesis`: the figures and numbers of the source, as printed and as computed.
 
 Source: P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
-thesis, NIT Rourkela, 2012. Each number that contradicts it is found by two independent methods.
+thesis, NIT Rourkela, 2012. Each number that contradicts it is computed by two independent methods.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -34,12 +34,12 @@ from gcs.views.page import rendered
 
 PAGE_FILE = "thesis.md"
 PUBLISHED_S = (0.185, 0.195)
-"""The values that round to the published 0.19 s."""
+"""Range of values that round to the published 0.19 s."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One number or statement: its place, what is printed, what is computed, and a second, independent check."""
+    """One number or statement of the source: its place, printed and computed value, and a second, independent check."""
 
     place: str
     subject: str
@@ -51,7 +51,7 @@ class Claim:
 
 
 def claims(ended: Callable[[int], None] = lambda _: None) -> list[Claim]:
-    """All claims, in the order of the source; `ended` is called after each part with the number still to come."""
+    """All claims, in the order of the source; `ended` is called after each part with the number left."""
     parts = (_modelling, _inclusion, _disturbance, _expansion, _graph, _sweep_algorithm, _delay, _subsets, _comparison)
     found: list[Claim] = []
     for left, part in zip(reversed(range(len(parts))), parts, strict=True):
@@ -61,7 +61,7 @@ def claims(ended: Callable[[int], None] = lambda _: None) -> list[Claim]:
 
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of (5.2): own errors are fed back at once, those of others late."""
+    """(A0, A1) of (5.2): a vehicle's own errors are fed back at once, those of others with delay."""
     own = own_part(CHAIN, checked_pattern_gain(pattern, K))
     return CHAIN.A + CHAIN.B @ own, CHAIN.B @ (K - own)
 
@@ -73,7 +73,7 @@ def _modelling() -> Iterator[Claim]:
     _, flown = thesis_flights.fly_with_late_neighbours(
         CHAIN, K, start, delay_s=0.0, speed_m_s=thesis_flights.SPEED_M_S, duration_s=1.0
     )
-    # the same hold of 1 ms in the linear model: one exponential a step
+    # the same hold of 1 ms in the linear model: one matrix exponential per step
     generator = np.zeros((CHAIN.states + CHAIN.inputs,) * 2)
     generator[: CHAIN.states] = np.hstack([CHAIN.A, CHAIN.B])
     from scipy.linalg import expm
@@ -322,7 +322,7 @@ def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
 
 
 def s_procedure_counterexample() -> tuple[bool, bool, bool]:
-    """For F = G = −1: whether F > 0 wherever G ≤ 0, whether F − τG > 0 for some τ ≥ 0, and whether F + τG > 0."""
+    """For F = G = −1: whether F > 0 wherever G ≤ 0, whether F − τG > 0 for some τ ≥ 0, and the same for F + τG > 0."""
     F = G = -1.0
     some = np.linspace(0.0, 100.0, 1001)
     return not (G <= 0.0) or F > 0.0, bool((F - some * G > 0.0).any()), bool((F + some * G > 0.0).any())
@@ -343,16 +343,16 @@ def first_crossing(own: float, late: float, sign: float) -> float:
 def late_choices(
     model: FormationModel, K: FloatArray, parts: Sequence[FloatArray]
 ) -> Iterator[tuple[tuple[bool, ...], tuple[FloatArray, FloatArray]]]:
-    """Each choice of which parts of K are late, at least one, with (A0, A1) of the loop that has them late."""
+    """Each choice of which parts of K are delayed, at least one, with (A0, A1) of the resulting loop."""
     for chosen in islice(product((False, True), repeat=len(parts)), 1, None):
         late = np.sum(list(compress(parts, chosen)), axis=0)
         yield chosen, (model.A + model.B @ (K - late), model.B @ late)
 
 
 def _late_entries() -> list[tuple[FloatArray, FloatArray]]:
-    """(A0, A1) for each of the 4,095 choices of which of the twelve printed scalar gains are late.
+    """(A0, A1) for each of the 4,095 choices of which of the twelve printed scalar gains are delayed.
 
-    One axis: the blocks are multiples of the identity, except for entries of at most 0.0053.
+    One axis is enough: the blocks are multiples of the identity, except for entries of at most 0.0053.
     """
     K = printed_gains()[::2, ::2]
     places = np.flatnonzero(np.abs(K) > 0.1)
@@ -363,18 +363,18 @@ def _late_entries() -> list[tuple[FloatArray, FloatArray]]:
 
 @cache
 def subset_margins() -> FloatArray:
-    """The delay margin for each choice of which of the twelve printed scalar gains are late."""
+    """The delay margin for each choice of which of the twelve printed scalar gains are delayed."""
     margins: list[float] = []
     for now, late in _late_entries():
         try:
             margins.append(delay_margin(now, late))
-        except np.linalg.LinAlgError:  # the resolvent is singular on the axis
+        except np.linalg.LinAlgError:  # the resolvent is singular on the imaginary axis
             margins.append(frequency_sweep_margin(now, late))
     return np.array(margins)
 
 
 def subset_margin_by_sweep(number: int) -> float:
-    """The margin of one of the subsets of `subset_margins` by the frequency sweep."""
+    """One of the margins of `subset_margins`, by the frequency sweep."""
     return frequency_sweep_margin(*_late_entries()[number])
 
 

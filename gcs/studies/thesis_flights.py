@@ -1,4 +1,4 @@
-"""The source's figures and the flights behind them: flown by our station; those of chapter 5 by the nonlinear model."""
+"""The source's figures and their flights: flown by our station, except chapter 5, which uses the nonlinear model."""
 
 from functools import cache
 from pathlib import Path
@@ -29,7 +29,7 @@ ALPHA = 0.93
 SPEED_M_S = 91.44  # 300 ft/s
 DELAYS_S = (0.17, 0.9, 1.1)
 CHAIN, SINGLE = FormationModel((-1, 0, 1)), FormationModel((-1, 0, 1), axes=1)
-"""The source's three vehicles, with both axes and with one."""
+"""The source's three vehicles, on both axes and on one."""
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#8a6d1f")
 _FT = 0.3048
 _SHOTS = 7
@@ -47,7 +47,7 @@ def _scenario(name: str) -> Scenario:
 
 @cache
 def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times and errors of the nonlinear flight with the printed gains: 20 s, with initial errors of our choice."""
+    """Times and errors of a nonlinear flight of 20 s with the printed gains, from initial errors of our choice."""
     start = np.array([2.0, -1.0, 10.0, 5.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0])
     return fly_with_late_neighbours(
         CHAIN, printed_gains(), start, delay_s=delay_s, speed_m_s=SPEED_M_S, duration_s=20.0
@@ -55,12 +55,12 @@ def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
 
 
 def nonlinear_response(delay_s: float) -> tuple[float, float]:
-    """Growth rate (1/s) of the errors' envelope, and the time from which they stay within 2 % of their largest."""
+    """Growth rate (1/s) of the errors' envelope, and the time after which they stay within 2 % of their maximum."""
     time_s, errors = late_flight(delay_s)
     size = np.linalg.norm(errors, axis=1)
     outside = np.flatnonzero(size > 0.02 * size.max())
     settled_s = float(time_s[min(outside[-1] + 1, len(time_s) - 1)])
-    # the largest error of each second, while it is above rounding
+    # envelope: the largest error of each second, while it is above rounding
     whole = int(time_s[-1])
     envelope = size[: whole * 1000].reshape(whole, 1000).max(axis=1)
     kept = (envelope > 1e-9 * envelope.max()) & (np.arange(whole) >= whole // 4)
@@ -78,7 +78,7 @@ def flown(name: str, method: str) -> tuple[TickArray, float | None]:
 
 @cache
 def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
-    """The plan of a scenario without link delay, with gains of inclusion at α = 0.93, or of a graph method at the same
+    """Design and plan of a scenario without link delay, by inclusion with α = 0.93, or by a graph method with the same
     delay margin."""
     scenario = _scenario(name)
     control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
@@ -92,11 +92,11 @@ def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
 def fly_with_late_neighbours(
     formation: FormationModel, K: FloatArray, start: FloatArray, *, delay_s: float, speed_m_s: float, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and errors e (k, states) of the source's nonlinear model with late information from neighbours, (5.1).
+    """Times (k,) and errors e (k, states) of the source's nonlinear model with delayed data from neighbours, (5.1).
 
     X' = V cos ψ, Y' = V sin ψ, ψ' = ω, V' = a with (a, ω) = M(ξ) u, (2.2)-(2.6), integrated by RK4 with M in every
-    stage; u_i(t) = K_ii x_i(t) + sum of K_ij x_j(t − h), held for one step of 1 ms. The vehicles start with the errors
-    `start` (states,), constant until then, and head north. It shares no code with the vehicles of the flights.
+    stage; u_i(t) = K_ii x_i(t) + sum of K_ij x_j(t − h), held for one step of 1 ms. Before t = 0 the errors are
+    constant at `start` (states,); the formation heads north. The model shares no code with the simulated vehicles.
     """
     steps, lag = round(duration_s / STEP_S), round(delay_s / STEP_S)
     own = own_part(formation, K)
@@ -113,7 +113,7 @@ def fly_with_late_neighbours(
 
 
 def _states(formation: FormationModel, errors: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Rows (X, Y, ψ, V) with these errors; the wanted spacing is zero, as it cancels."""
+    """Rows (X, Y, ψ, V) with these errors; the wanted spacing cancels and is taken as zero."""
     rows: list[FloatArray] = []
     for i, ahead in enumerate(formation.predecessors):
         velocity = nominal + errors[formation.velocity_slice(i)]
@@ -147,7 +147,7 @@ def _rates(state: FloatArray, u: FloatArray) -> FloatArray:
 
 
 def formation_figure(file: Path, method: str) -> Path:
-    """Figures 3.2-3.6 (inclusion) and 4.3-4.7 (graph): superimposed snapshots and distances of three flights."""
+    """Draw figures 3.2-3.6 (inclusion) or 4.3-4.7 (graph): superimposed snapshots and distances of three flights."""
     titles = {"triangle5": "first", "triangle5_scattered": "second", "triangle5_turns": "turns"}
     figure, plots = figure_of(2, (12.0, 7.0), heights=(1.3, 1.0), columns=3)
     for column, (name, title) in enumerate(titles.items()):
@@ -186,7 +186,7 @@ def _distances(plot: Any, ticks: TickArray, until_s: float) -> None:
 
 
 def responses_figure(file: Path) -> Path:
-    """Figures 5.2-5.4: the errors of the three vehicles at h = 0.17 s, and the same at 0.9 s and 1.1 s."""
+    """Draw figures 5.2-5.4, the errors of the three vehicles at h = 0.17 s, and the same at 0.9 s and 1.1 s."""
     figure, plots = figure_of(3, (12.0, 8.0), heights=(1.0, 1.0, 1.0), columns=3)
     for column, delay_s in enumerate(DELAYS_S):
         time_s, errors = late_flight(delay_s)

@@ -1,4 +1,4 @@
-"""Flights in virtual time from Python: a scenario in, the flight's design, verdict and record out."""
+"""Flights in virtual time from Python: takes a scenario, and returns the flight's design, verdict and record."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ from scenarios.shipped import located
 class VirtualFlight:
     """A flight in virtual time. Arrays have one row for each control tick and one column for each vehicle.
 
-    A value is NaN where the station does not know it: the leader has no spacing error, for example.
+    Values that the station does not know are NaN: for example, the leader has no spacing error.
     """
 
     scenario: Scenario
@@ -96,7 +96,7 @@ class VirtualFlight:
 
 
 def load_scenario(scenario: Path | str) -> Scenario:
-    """The scenario in a file, or the shipped one of this name; scenarios.errors.ScenarioError if there is neither."""
+    """The scenario in a file, or a shipped one by name. Raises scenarios.errors.ScenarioError if there is neither."""
     return load(located(str(scenario)))
 
 
@@ -105,9 +105,9 @@ def fly_virtual(
 ) -> VirtualFlight:
     """Fly a scenario in virtual time: real MAVLink bytes, emulated links, no sockets, no files.
 
-    `scenario` is a scenario, its file, or the name of one that ships (`gcs scenarios`). Gains whose loop is unstable
-    even without delay are flown if `allow_unstable`, and the Python code that a scenario names is run if `allow_code`.
-    Vehicles that share a loop over links that differ have the margin of these links (`gcs.plan.planner`).
+    `scenario` is a scenario, its file, or the name of a shipped one (`gcs scenarios`). `allow_unstable` flies gains
+    whose loop is unstable even without delay, and `allow_code` runs the Python code that a scenario names. Vehicles
+    that share a loop over different links have the margin over these links (`gcs.plan.planner`).
 
     Raises scenarios.errors.ScenarioError if the file is not a scenario, gcs.errors.InputError if `gcs fly` would refuse
     it, and gains.GainsError if its requirement cannot be met.
