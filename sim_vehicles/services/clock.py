@@ -13,7 +13,7 @@ PARTS = 1_000_000_000
 
 @kernel
 def boot_ns(start_ns: int, offset_ns: int, drift_ppb: int, host_ns: int) -> int:
-    """What a clock shows. Whole seconds are multiplied apart: times `PARTS`, nine of them would not fit 64 bits."""
+    """Boot time that a clock shows. Whole seconds are multiplied separately: no product then exceeds 64 bits."""
     whole, rest = divmod(host_ns - start_ns, PARTS)
     return offset_ns + (host_ns - start_ns) + whole * drift_ppb + rest * drift_ppb // PARTS
 
@@ -27,7 +27,7 @@ def host_ns(start_ns: int, offset_ns: int, drift_ppb: int, boot_ns: int) -> int:
 
 @dataclass(frozen=True)
 class BootClock:
-    """Converts host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back, without rounding drift."""
+    """Converts host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back in exact integers."""
 
     start_ns: int
     """Host time at which the clock shows `offset_ns`."""
