@@ -1,6 +1,6 @@
 """The links of a scenario in front of other programs' vehicles, as one function of datagrams and time.
 
-A vehicle is known by the system id of its first frame; only headers are read. A vehicle gets the same links, random
+A vehicle is identified by the system id in its first frame; only headers are read. It gets the same links, random
 streams and truth log that it would have in a Fleet.
 """
 
@@ -42,7 +42,7 @@ def sender(data: bytes) -> int | None:
 
 
 def holds_key(data: bytes) -> bool:
-    """Whether SETUP_SIGNING, which is never passed on, may begin anywhere in a datagram: receivers skip stray bytes."""
+    """Whether a SETUP_SIGNING frame, which is never passed on, may begin anywhere: receivers skip stray bytes."""
     at = data.find(SETUP_SIGNING, 7)
     while at >= 0 and data[at - 7] != MAGIC_2:
         at = data.find(SETUP_SIGNING, at + 1)
@@ -59,7 +59,7 @@ class Relay:
         most = max(MOST_IN_NETWORK, len(scenario.vehicles))
         self._links = LinkSet(scenario, start_ns, recorder=recorder, most=most)
         self._entering: list[Passing] = []
-        """Datagrams received later than the last step's now: an earlier one may still be unread."""
+        """Datagrams stamped later than the last step: an earlier one may still be unread."""
 
     @property
     def counters(self) -> Counter[str]:
