@@ -23,7 +23,7 @@ from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.mavlink import message_id
 
 CAPACITY = 10_000
-"""Maximum number of datagrams under way: twice what 100 s of delay at 50 Hz need. A full link drops and counts more."""
+"""Maximum number of datagrams under way: twice what 100 s of delay at 50 Hz need. Any more are dropped and counted."""
 
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
