@@ -15,7 +15,7 @@ Datagram = tuple[int, bytes, int]
 class Datagrams:
     """Datagrams in order; iterating over them yields tuples.
 
-    The rows of `table` (4, n) are begin and end of each datagram in `stream`, the vehicle's row in the fleet, and the
+    The rows of `table` (4, n) are start and end of each datagram in `stream`, the vehicle's row in the fleet, and the
     time in ns. `system_ids` holds the system id of each row of the fleet.
     """
 

@@ -92,7 +92,7 @@ class Sockets:
     def send(self, stream: Bytes, table: Ints, addresses: Ints | None = None) -> None:
         """Send datagrams to addresses with these numbers, or to the sockets' peers; failures are counted.
 
-        The rows of `table` (4, n) are begin and end of each datagram in `stream`, the descriptor of the socket, and the
+        The rows of `table` (4, n) are start and end of each datagram in `stream`, the descriptor of the socket, and the
         due time in ns.
         """
         begins, ends, descriptors, due_ns = table

@@ -55,7 +55,7 @@ class Channel:
         self._waiting_bytes = 0
 
     def send(self, size_bytes: int, time_ns: int) -> tuple[int, int] | None:
-        """Begin and end of a datagram's transmission, or None if the queue is full.
+        """Start and end of a datagram's transmission, or None if the queue is full.
 
         Calls must be in order of time.
         """
@@ -273,7 +273,7 @@ class LinkSet:
             self._in_rows[row].draw()
 
     def hear(self, data: bytes, time_ns: int) -> None:
-        """Look for the station's first set-point, which begins the flight and the links' time."""
+        """Begin the flight and the links' time, if this is the station's first set-point."""
         if is_set_point(data) and time_ns < self.zero_ns:
             self.zero_ns = time_ns
             for link in self._in_rows:

@@ -150,11 +150,11 @@ def enter_later(
     link: Record, entries: Records, frames: Bytes, draws: Records, truth: Records, entry: int,
     time_ns: int, begin_ns: int, end_ns: int, delay_ns: int,
 ) -> int:  # fmt: skip
-    """Let a datagram enter, given the begin and end of its transmission and its delay without jitter.
+    """Let a datagram enter, given the start and end of its transmission and its delay without jitter.
 
     Returns its fate; with DUPLICATE and LINK_FULL together, only its duplicate was dropped.
     """
-    link.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
+    link.entered += 1  # also the order of datagrams that are due at the same time: first in, first out
     datagram = entries[entry]
     datagram.number, datagram.entered_ns, datagram.queued_ns = link.entered, time_ns, begin_ns - time_ns
     datagram.fate = PASSED

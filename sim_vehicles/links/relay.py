@@ -67,12 +67,12 @@ class Relay:
 
     @property
     def next_event_ns(self) -> int:
-        """Before this instant `step` returns nothing, unless datagrams arrive."""
+        """Before this time `step` returns nothing, unless datagrams arrive."""
         due_ns = self._links.next_due_ns
         return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
 
     def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
-        """The datagrams that leave the links by now, with their exact instants, in order of time."""
+        """The datagrams that leave the links by now, with their exact times, in order of time."""
         entering = self._entering
         for passing in received:
             heapq.heappush(entering, passing)

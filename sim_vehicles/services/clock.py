@@ -20,7 +20,7 @@ def boot_ns(start_ns: int, offset_ns: int, drift_ppb: int, host_ns: int) -> int:
 
 @kernel
 def host_ns(start_ns: int, offset_ns: int, drift_ppb: int, boot_ns: int) -> int:
-    """The first host nanosecond at which a clock shows at least `boot_ns`."""
+    """The earliest host time (ns) at which a clock shows at least `boot_ns`."""
     whole, rest = divmod(offset_ns - boot_ns, PARTS + drift_ppb)
     return start_ns - whole * PARTS - rest * PARTS // (PARTS + drift_ppb)
 
@@ -45,7 +45,7 @@ class BootClock:
         return boot_ns(self.start_ns, self.offset_ns, self.drift_ppb, host_time_ns)
 
     def host_ns(self, boot_time_ns: int) -> int:
-        """The first host nanosecond at which the clock shows at least `boot_time_ns`."""
+        """The earliest host time (ns) at which the clock shows at least `boot_time_ns`."""
         return host_ns(self.start_ns, self.offset_ns, self.drift_ppb, boot_time_ns)
 
 

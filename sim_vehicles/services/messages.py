@@ -166,7 +166,7 @@ def named_int(boot_ms: int, name: str, value: int) -> Message:
 
 
 class Condition(NamedTuple):
-    """A vehicle's state at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
+    """A vehicle's state at one time, for GLOBAL_POSITION_INT and the messages of EXTRA."""
 
     time_boot_ms: int
     place_deg: tuple[float, float]

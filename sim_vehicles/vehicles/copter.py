@@ -1,6 +1,6 @@
 """A simulated multicopter that behaves like ArduCopter or PX4 as seen from outside.
 
-It boots, sends heartbeats, then telemetry, then gets a position. It can be armed, takes off to an altitude, follows
+It boots, sends heartbeats, then telemetry, then has a position. It can be armed, takes off to an altitude, follows
 velocity and acceleration set-points with a lag, and lands. The fleet flies it if the scenario has `dynamics =
 "autopilot"`.
 """

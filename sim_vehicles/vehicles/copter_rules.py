@@ -31,7 +31,7 @@ def px4_mode(main: int, sub: int = 0) -> int:
 
 @dataclass(frozen=True)
 class Rules:
-    """How one autopilot, ArduCopter or PX4, behaves and what it reports."""
+    """Behaviour and reports of one autopilot, ArduCopter or PX4."""
 
     autopilot: int
     """MAV_AUTOPILOT"""

@@ -31,7 +31,7 @@ class Hold:
         self._arrivals: deque[int] = deque()
         self._ordered: list[int] = []
         self._queue: list[tuple[int, int, Setpoint]] = []
-        """(instant, number, set-point), earliest first."""
+        """(due time in ns, number, set-point), earliest first."""
         self._taken = self._newest_ms = self._newest_ns = 0
 
     def take(self, setpoint: Setpoint, time_ns: int, clock: BootClock) -> bool:

@@ -28,7 +28,7 @@ _AXES = "NE"
 _NAMES_P, _NAMES_V = ([f"FORM_{kind}_{i}{j}" for i in _AXES for j in _AXES] for kind in ("KP", "KV"))
 
 Look = tuple[float, float, float, float]
-"""What the sensor measures: position and velocity of another vehicle relative to this one, north and east."""
+"""A measurement of the sensor: position and velocity of another vehicle relative to this one, north and east."""
 
 
 def formation_parameters() -> list[Parameter]:

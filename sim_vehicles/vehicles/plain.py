@@ -225,7 +225,7 @@ def _enter_all(
 ) -> int:  # fmt: skip
     """Let datagrams from `first` on enter their down links; returns the first that cannot, or their number.
 
-    The rows of `received` are begin and end of each datagram in `data`, the vehicle's row, and the time.
+    The rows of `received` are start and end of each datagram in `data`, the vehicle's row, and the time.
     """
     for k in range(first, received.shape[1]):
         begin, size, row = received[0, k], received[1, k] - received[0, k], row_of(received[2, k], LINK_DOWN)
@@ -277,7 +277,7 @@ def leave_all(
 
     Those for which `leaving` has no column or `truth` no row are left to the next call.
 
-    The rows of `leaving` are begin and end of each datagram in `data`, the vehicle's row, and the time.
+    The rows of `leaving` are start and end of each datagram in `data`, the vehicle's row, and the time.
     """
     count = end = 0
     for row in range(len(vehicles)):

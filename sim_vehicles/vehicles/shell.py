@@ -113,7 +113,7 @@ class Radio:
 
 
 class Craft(Protocol):
-    """What flies in a shell. Calls are in order of time; `acts_at` says when a message that arrives late acts."""
+    """The craft in a shell. Calls are in order of time; `acts_at` says when a message that arrives late acts."""
 
     parameters: Parameters
     version: tuple[int, int, int]
@@ -126,7 +126,7 @@ class Craft(Protocol):
     intervals_us: Mapping[int, int]
     """The messages it can report besides heartbeats, each with its default interval, 0 for none."""
     reports_from_ns: int
-    """Before this instant it sends heartbeats only."""
+    """Before this time it sends heartbeats only."""
 
     @property
     def deadline_ns(self) -> int: ...  # of the next event that is not a report
