@@ -1,4 +1,4 @@
-"""The error of scenario files, in a module of its own so that naming it does not import what reads them."""
+"""Errors of scenario files, in a module of their own: importing them does not import the reader."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -17,8 +17,8 @@ class InWords(str):
 class ScenarioError(Exception):
     """The scenario cannot be flown: one line with file, key, what was read and what was wanted.
 
-    `place` is the key with the line in front of it, or empty if `file` says it all. Where None was read, there is
-    nothing in the file.
+    `place` is the key with the line in front of it, or empty if `file` says it all. None as `read` means that the file
+    has nothing there.
     """
 
     def __init__(self, file: Path, place: str, read: object, wanted: str) -> None:
@@ -29,7 +29,7 @@ class ScenarioError(Exception):
 
 
 class UnreadableError(ScenarioError):
-    """What was named is no text file."""
+    """The named file is missing, unreadable, empty or no text."""
 
     def __init__(self, path: Path, read: str, wanted: str = "") -> None:
         run = path / "scenario.toml"

@@ -99,7 +99,7 @@ def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path
 
 
 def checked(scenario: Scenario, file: Path) -> Scenario:
-    """A changed scenario, if its keys do not contradict each other; else raises ScenarioError, which names the file."""
+    """Returns a changed scenario if its keys do not contradict each other; else ScenarioError names the file."""
     for key, read, wanted in _contradictions(scenario):
         raise ScenarioError(file, key, read, wanted)
     return scenario
@@ -126,7 +126,7 @@ def fingerprint(scenario: Scenario) -> str:
 
 
 def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
-    """The error, with the line in the file and the system id in place of a vehicle's index."""
+    """The error, with the key's line in the file, and the system id in place of a vehicle's index."""
     return ScenarioError(file, place_of(key, text, data), read, wanted)
 
 
@@ -381,7 +381,7 @@ def _links_contradictions(scenario: Scenario) -> Iterator[Fault]:
 
 
 def _repeated(part: str, name: str, values: Sequence[object], wanted: str) -> Iterator[Fault]:
-    """The values of a key that an earlier entry of a list already has."""
+    """Faults for the values of a key that repeat those of earlier entries of a list."""
     for k, value in enumerate(values):
         if value in values[:k]:
             yield f"{part}[{k}].{name}", value, wanted

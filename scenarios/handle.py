@@ -1,7 +1,7 @@
-"""A tuple of arrays that is handed to kernels as one object.
+"""Passes a tuple of arrays to kernels as one object.
 
-A kernel looks at each array of a tuple at every call, and counts references to it, which takes longer than what it does
-with those of a few vehicles: 0.2 µs an array. A handle is looked at once. Importing this imports Numba.
+At every call a kernel unpacks each array of a tuple and counts references to it: 0.2 µs an array, longer than its own
+work on a few vehicles. A handle is unpacked once. Importing this module imports Numba.
 """
 
 from typing import Any
@@ -25,10 +25,10 @@ class _HandleType(_types.StructRef):
 
 
 class Handle(structref.StructRefProxy):
-    """In a kernel, its attribute `arrays` is the tuple. Whoever replaces an array of it makes a new handle."""
+    """In a kernel, its attribute `arrays` is the tuple. Replacing one of the arrays requires a new handle."""
 
     kept: Any
-    """The tuple; while it exists, so do the arrays."""
+    """The tuple, which keeps the arrays alive."""
 
 
 _structref.define_proxy(Handle, _HandleType, ["arrays"])
@@ -43,13 +43,13 @@ def handle(arrays: Any) -> Handle:
 
 @array_kernel
 def _handle(arrays: Any) -> Any:
-    """What is kept of it on disk names the classes of the tuples: when one is renamed, this file has to change, too."""
+    """The compiled code cached on disk names the tuples' classes: when one is renamed, this file has to change, too."""
     return Handle(_borrowed(arrays))
 
 
 @_intrinsic
 def _borrowed(_: Any, arrays: Any) -> Any:
-    """The same arrays, to which kernels count no references."""
+    """The same arrays without owners, so that kernels count no references to them."""
 
     def without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         if isinstance(kind, _types.Array):

@@ -1,4 +1,4 @@
-"""The length of a vector in kernels, to the same bit as CPython's `math.hypot`; the C library's differs in the last."""
+"""Vector length for kernels, bit-identical to CPython's `math.hypot`; the C library's differs in the last bit."""
 
 import math
 
@@ -12,7 +12,7 @@ _SPLIT = 134217729.0
 def hypot(x: float, y: float) -> float:
     """The square root of x² + y², as CPython 3.11 computes it (`vector_norm` in mathmodule.c).
 
-    The squares are added as exact sums of their halves, to 1.0, and the root is corrected by what its own square lacks.
+    The squares are added to 1.0 as exact sums of their halves, and the root is corrected by the residual of its square.
     """
     x, y = abs(x), abs(y)
     most = max(x, y)
@@ -54,6 +54,6 @@ def _halves(x: float) -> tuple[float, float]:
 
 @kernel
 def _add(sum_: float, rest: float, x: float) -> tuple[float, float]:
-    """A sum with one more term, and what rounding has left out of it."""
+    """Compensated addition: a sum with one more term, and the rounding errors so far."""
     total = sum_ + x
     return total, rest + ((sum_ - total) + x)

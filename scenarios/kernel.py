@@ -1,9 +1,8 @@
-"""Functions that run for every frame of every vehicle, compiled by Numba, and the records that they work on.
+"""Kernels: functions that run for every frame of every vehicle, compiled by Numba, and the records they work on.
 
 A kernel works on numpy arrays of records, one for each vehicle, and gives the same bits as Python would. It is compiled
-at its first call, and kept on disk for later processes. What is kept counts for as long as neither the kernel's file
-nor a kernel, number or tuple that it uses has changed. Numba is not even imported before the first call: most commands
-fly nothing.
+at its first call, and cached on disk for later processes. The cache is valid until the kernel's file or a kernel,
+number or tuple that it uses changes. Numba is not even imported before the first call: most commands fly nothing.
 """
 
 import hashlib
@@ -29,16 +28,16 @@ int64: Any = np.int64
 
 
 def kernel(function: F) -> F:
-    """The function, compiled when it is first called. It must raise nothing: a datagram may hold anything.
+    """The function, compiled when it is first called. It must not raise: a datagram may hold anything.
 
-    It makes no arrays, so references to arrays are not counted, which would take most of its time.
+    It makes no arrays, so references to arrays are not counted: counting would take most of its time.
     """
     compiled: Any = _Kernel(function, makes_arrays=False)
     return compiled
 
 
 def array_kernel(function: F) -> F:
-    """The same of a function that makes arrays, or calls one that returns new ones."""
+    """As `kernel`, for a function that makes arrays, or calls one that returns new ones."""
     compiled: Any = _Kernel(function, makes_arrays=True)
     return compiled
 
@@ -46,8 +45,7 @@ def array_kernel(function: F) -> F:
 def at_row(run: Callable[Concatenate[Record, P], T]) -> Callable[Concatenate[Records, int, P], T]:
     """A kernel as Python calls it: with an array of records and a row in place of the record that it works on.
 
-    Each is a function of its own, `_at_row` with its kernel in place of the global `_run`, for the compiler knows
-    kernels only as globals.
+    Each is a copy of `_at_row` whose global `_run` is its kernel, as the compiler knows kernels only as globals.
     """
     inner: Any = run
     outer = FunctionType(_at_row.__code__, {"_run": run}, "_at_row")
@@ -76,12 +74,12 @@ class _Kernel:
 
     @property
     def _numba_type_(self) -> Any:
-        """What Numba asks of a function that a kernel calls."""
+        """The type by which Numba knows a function that a kernel calls."""
         return self._for_kernels._numba_type_
 
     @cached_property
     def _for_kernels(self) -> Any:
-        """What kernels call: unless Python has, without the code by which it would, a sixth of the compilation."""
+        """The dispatcher for kernels: Python's if compiled, else one without Python's wrapper, a sixth of the work."""
         return self._compiled or self._dispatcher(for_python=False)
 
     def _compile(self) -> Callable[..., Any]:
@@ -89,14 +87,14 @@ class _Kernel:
         return compiled
 
     def _dispatcher(self, *, for_python: bool) -> Any:
-        """What compiles the function for every kind of arguments it is called with, at the first such call."""
+        """Numba's dispatcher, which compiles the function at the first call with each combination of argument types."""
         import numba
         from numba.core import config
 
         settings: Any = config
         compiler: Any = numba
         folder, before = _cache(settings.CACHE_DIR), settings.CACHE_DIR
-        # an index of its own for each state of the source: Numba's does not see what a kernel calls
+        # a cache folder for each state of the source: Numba's own index does not see what a kernel calls
         settings.CACHE_DIR = (
             ""
             if folder is None
@@ -118,7 +116,7 @@ class _Kernel:
 
     @cached_property
     def _stamp(self) -> str:
-        """A name for the function's source, and for that of all it calls and the constants that these use."""
+        """A hash of the function's source, of that of all kernels it calls, and of the constants that these use."""
         reached: dict[str, bytes] = {}
         left = [self]
         while left:
@@ -141,7 +139,7 @@ def any_kept() -> bool:
 
 
 def _cache(wanted: str) -> Path | None:
-    """Where compiled kernels are kept; None if nothing can be."""
+    """The folder in which compiled kernels are cached; None if there can be none."""
     try:
         folder = Path(wanted or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "formation-gcs"
         folder.mkdir(parents=True, exist_ok=True)
@@ -151,7 +149,7 @@ def _cache(wanted: str) -> Path | None:
 
 
 class Columns(dict[str, Any]):
-    """The fields of a structured array by name: a number in one is read in 40 ns, in a record in 500 ns."""
+    """The fields of a structured array by name: reading a number in one takes 40 ns, in a record 500 ns."""
 
     def __init__(self, records: Records) -> None:
         super().__init__()
@@ -163,9 +161,9 @@ class Columns(dict[str, Any]):
 
 
 class Cell(Generic[T]):
-    """An attribute that is a number in row `_row` of the `_columns` of its object.
+    """A descriptor: the attribute is a number in row `_row` of the `_columns` of its object.
 
-    The column has the attribute's name, without an underscore before it. With `unknown`, that number stands for None.
+    The column has the attribute's name, without a leading underscore. With `unknown`, that number stands for None.
     """
 
     def __init__(self, unknown: object = None) -> None:

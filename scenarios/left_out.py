@@ -1,9 +1,9 @@
-"""A formation without some of its vehicles: the others keep their places relative to each other.
+"""Leaves vehicles out of a formation: the others keep their places relative to each other.
 
-A follower of a vehicle that is left out follows the one in front of that, at the sum of both offsets. If the leader is
-left out, its follower with the lowest system id leads, and the others follow that one. So the scenario stays a complete
-formation, for which gains, margins and figures are computed as for any other. Followers left without anybody in front
-would instead make groups that keep no distance from each other.
+A follower of a vehicle that is left out follows the one in front of that vehicle, at the sum of both offsets. If the
+leader is left out, its follower with the lowest system id leads, and the others follow that one. So the scenario
+remains a complete formation, with gains, margins and figures like any other. Followers with nobody in front would
+instead form groups that keep no distance from each other.
 """
 
 from collections.abc import Iterable

@@ -21,9 +21,9 @@ TRACE_COLUMN = "delay_s"
 
 
 def load_profile(name: str, beside: Path, key: str) -> LinkProfile:
-    """The profile of a name, or in a file relative to the folder of the file `beside`, whose `key` names it.
+    """The profile with a name, or in a file relative to the folder of the file `beside`, whose `key` names it.
 
-    Raises ScenarioError.
+    Raises ScenarioError if there is none, or if it cannot be read or is no profile.
     """
     shipped = names(PROFILES)
     path = PROFILES / f"{name}.toml" if name in shipped else beside.parent / name
@@ -60,7 +60,7 @@ def each_link(links: Links) -> Iterator[tuple[str, Link]]:
 
 
 def with_traces(scenario: Scenario, file: Path) -> Scenario:
-    """The scenario with the delays in place of the names of trace files, so that it is complete without the files."""
+    """The scenario with the delays themselves in place of the names of trace files, complete without the files."""
     traces: dict[str, tuple[float, ...]] = {}
     for key, link in each_link(scenario.links):
         if link.jitter is not None and (name := link.jitter.trace_file) is not None:

@@ -1,4 +1,4 @@
-"""What contradicts the course and the formation changes of a scenario."""
+"""Contradictions in the course and the formation changes of a scenario."""
 
 import math
 from collections.abc import Iterator

@@ -1,7 +1,7 @@
-"""Formations of several networks. MAVLink has 250 system ids for vehicles, so more of them need more networks.
+"""Formations of several networks: MAVLink has 250 system ids for vehicles, so more vehicles need more networks.
 
-Each network has a UDP port of its own at the station. A system id above 1000 names a vehicle of another network than 0:
-2017 is the vehicle that has the MAVLink system id 17 in network 2.
+Each network has a UDP port of its own at the station. A system id above 1000 names a vehicle outside network 0: 2017 is
+the vehicle with MAVLink system id 17 in network 2.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ MOST_VEHICLES = 1000
 
 
 def wire_id(system_id: int) -> int:
-    """The system id of a vehicle in frames."""
+    """The MAVLink system id of a vehicle, which its frames carry."""
     return system_id % NETWORK
 
 

@@ -36,7 +36,7 @@ def code_names(scenario: Scenario) -> dict[str, str]:
 
 
 def own_code_faults(scenario: Scenario) -> Iterator[Fault]:
-    """What contradicts the user's own controller or dynamics."""
+    """Contradictions in the keys of the user's own controller or dynamics."""
     control, own_law = scenario.control, scenario.control.method == "python"
     own_dynamics = scenario.dynamics not in BUILT_IN
     if own_law != (control.controller is not None):
@@ -120,9 +120,9 @@ def refusal(scenario: Scenario, file: Path, where: str = "") -> str | None:
 
 
 def function_of(scenario: Scenario, key: str) -> Any:
-    """What a key of the scenario names in its code. This runs the file.
+    """The function that a key of the scenario names. This runs the file.
 
-    Raises ScenarioError if the file raises an exception or has no such name.
+    Raises ScenarioError if the file raises an exception or has no such function.
     """
     name = code_names(scenario)[key]
     path, _, wanted = name.rpartition(":")
@@ -141,7 +141,7 @@ def function_of(scenario: Scenario, key: str) -> Any:
 
 @lru_cache(maxsize=16)
 def _module(name: str, text: str) -> ModuleType:
-    """The module that the text of a file makes."""
+    """The module made by running the text of a file."""
     module = ModuleType(f"own_code_{sha256(text.encode()).hexdigest()[:16]}")
     module.__file__ = name
     sys.modules[module.__name__] = module  # dataclasses look their module up

@@ -1,4 +1,4 @@
-"""For errors in a scenario file: the line of a key, and what its value must be, in plain words."""
+"""Wording of errors in a scenario file: the line of a key, and what its value must be, in plain words."""
 
 import itertools
 import re
@@ -33,9 +33,9 @@ def place_of(key: str, text: str, data: Mapping[str, Any]) -> str:
 
 
 def line_of(text: str, location: Location) -> int | None:
-    """The line of a TOML text, from 1, of a location.
+    """The line, counted from 1, of a location in a TOML text; None if there is none.
 
-    Where it has no line of its own, that of the first part of it, or else of the part around it.
+    A location without a line of its own has that of its first part, or else that of the part around it.
     """
     lines: dict[Location, int] = {}
     tables: Counter[Location] = Counter()
@@ -70,7 +70,7 @@ def line_of(text: str, location: Location) -> int | None:
 
 
 def _outer_tables(line: str) -> int:
-    """How many inline tables a line begins that are in no other."""
+    """Number of inline tables that begin on a line and are in no other."""
     depths = itertools.accumulate((char == "{") - (char == "}") for char in line)
     return sum(char == "{" and depth == 1 for char, depth in zip(line, depths, strict=True))
 
@@ -117,7 +117,7 @@ _WANTED = {
     "dynamics": "double_integrator, autopilot, jsbsim, jsbsim:MODEL, or FILE.py:NAME",
     "prediction": "off, measured, or a number of seconds greater than 0, at most {most:g}",
 }
-"""What was wanted, by the type of pydantic's error."""
+"""Wording of what was wanted, by the type of pydantic's error."""
 
 
 def wanted_of(error: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""What contradicts the further requirements of a design, and `control.for_link`, which measures their delays."""
+"""Contradictions in the further requirements of a design, and in `control.for_link`, which measures their delays."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ _WITHOUT_DELAY = "damping_min", "natural_frequency_max_rad_s"
 
 
 def response_wanted(dynamics: str) -> str:
-    """What a scenario without a response lacks, and where its value is found."""
+    """Wording for a missing response in errors: what is wanted, and where its values are found."""
     found = "a flight leaves in design.json" if dynamics == "autopilot" else "gcs identify finds"
     return f"a [response], which {found}"
 
@@ -55,7 +55,7 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
 
 
 def _late_contradictions(scenario: Scenario, criteria: Criteria) -> Iterator[Fault]:
-    """Criteria of vehicles that do not respond at once."""
+    """Contradictions in the criteria for vehicles that do not respond at once."""
     whose, wanted = f"with dynamics {scenario.dynamics}", "it is for vehicles that respond at once"
     if scenario.control.for_link == "off":
         yield "control.criteria", InWords("requirements"), f"no such key {whose} and without for_link: {wanted}"

@@ -41,20 +41,20 @@ from scenarios.smooth import Bounds, SmoothCourse, course_by_steps, course_by_wa
 
 NS_PER_S = 1_000_000_000
 DRIFT_MAX_PPM = 1000.0
-"""Largest drift of a vehicle's clock. The station's clock estimates and their bounds hold up to this drift."""
+"""Largest drift of a vehicle's clock. The station's clock estimates and their bounds hold up to it."""
 
 
 class Vehicle(Part):
     """One UAV: whom it follows, where it flies relative to that vehicle, and its state when the flight begins."""
 
     system_id: SystemId
-    """MAVLink system id, 1 to 250, different for each vehicle. A vehicle of another network than 0 has 1000 times the
-    number of the network (1 to 9) added: 2017 is system 17 of network 2, which has a UDP port of its own."""
+    """MAVLink system id, 1 to 250, different for each vehicle. For a vehicle in network 1 to 9, add 1000 times the
+    number of the network: 2017 is system 17 of network 2, which has a UDP port of its own."""
     follows: SystemId | None = None
     """System id of the vehicle in front. Exactly one vehicle, the leader, omits it."""
     offset_ne_m: Position | None = None
-    """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10); every vehicle but the
-    leader needs it."""
+    """Wanted position relative to the vehicle in front (the negative of the spacing d of thesis eq. 2.10); required for
+    every vehicle but the leader."""
     hears: tuple[SystemId, ...] = ()
     """Vehicles other than the one in front whose errors its command may use. Graph methods only."""
     position_ne_m: Position
@@ -80,7 +80,7 @@ class Limits(Part):
     """Limits of every vehicle. Omitted ones are off, except the minimum speed: the kinematics are singular at zero."""
 
     speed_min_m_s: Positive = 1.0
-    """Minimum ground speed; not with `dynamics = "autopilot"`: multicopters can stand."""
+    """Minimum ground speed; not for `dynamics = "autopilot"`, as multicopters can hover."""
     speed_max_m_s: Positive | None = None
     """Maximum ground speed."""
     acceleration_max_m_s2: Positive | None = None
@@ -116,22 +116,22 @@ class Control(Part):
     """How the gains are found, and where the loop is closed.
 
     Without any requirement or gains, a delay margin of 0.3 s is required. If a delay margin is required, the design
-    maximises robustness; otherwise it maximises the delay margin. A requirement is met, or the design says why it
-    cannot be.
+    maximises robustness; otherwise it maximises the delay margin. The design meets every requirement, or says why it
+    cannot.
     """
 
     method: Literal["inclusion", "graph-dk", "graph-lqr", "python"] = "inclusion"
     """`inclusion`: every vehicle uses its own errors and the velocity error of the vehicle in front. `graph-lqr`
-    (structured LQR) and `graph-dk` (the D-K type iteration of the thesis): it uses all errors of these two vehicles and
-    of those it `hears`. `python`: the `controller` computes all commands."""
+    (structured LQR) and `graph-dk` (the D-K type iteration of the thesis): every vehicle uses all errors of itself, the
+    vehicle in front and those it `hears`. `python`: the `controller` computes all commands."""
     controller: CodeName | None = None
     """With `method = "python"`: the control law, a function in a Python file beside this one, such as
     `"my_law.py:law"`. Commands run it only with `--allow-code`."""
     linear: CodeName | None = None
-    """States that the controller is u = K e: a function in a Python file that returns K. The delay margin is then
-    computed."""
+    """Declares that the controller is linear, u = K e: a function in a Python file that returns K. The delay margin is
+    then computed."""
     loop: Literal["ground", "onboard"] = "ground"
-    """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
+    """`ground`: the station closes every loop, so all feedback is delayed. `onboard`: every vehicle feeds back its own
     errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
     `string_peak_max` holds at every delay, and `delay_margin_s` limits the vehicles' own gains as if the station closed
     their loop."""
@@ -145,30 +145,30 @@ class Control(Part):
     """Largest factor by which a spacing error may grow from one vehicle to the next at any frequency; 1 allows no
     growth."""
     criteria: Criteria | None = None
-    """Further requirements, and the loop delay for which gains are to be best."""
+    """Further requirements, and the loop delay for which the gains are optimised."""
     overlap: Overlap | None = None
-    """Whom every vehicle hears beside the vehicle in front; graph methods only."""
+    """Which vehicles every vehicle hears besides the one in front; graph methods only."""
     gains: FixedGains | None = None
     """Fly these gains instead of designing any."""
     blocks: tuple[GainBlock, ...] = ()
     """Fly this gain matrix, given block by block, instead of designing one. Omitted blocks are zero."""
     feed_forward: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the command of the vehicle in front that is added to each follower's command, computed in the same tick.
-    Gains are designed for it; margins do not depend on it. Only with `method = "inclusion"`, without `blocks`,
+    """Fraction of the command of the vehicle in front, computed in the same tick, that is added to each follower's
+    command. Gains are designed for it; margins do not depend on it. Only with `method = "inclusion"`, without `blocks`,
     `criteria` and `for_link`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower moves as the one in front."""
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
-    after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay
-    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. With `loop = "onboard"` what
-    the station streams is predicted. With `dynamics = "autopilot"` the file must give the `response`, which is part of
-    the prediction."""
+    after it. A number: a fixed delay in seconds. `measured`: the smoothed delay measured for each vehicle; the assumed
+    delay changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. With `loop =
+    "onboard"` the station predicts what it streams. With `dynamics = "autopilot"` the file must give the `response`,
+    which is part of the prediction."""
     execute_at: bool = False
     """True: a vehicle holds each set-point until a fixed time after its stamp, by which 99 % of the last 500 arrived.
     Jitter then becomes constant delay. Not with `dynamics = "autopilot"`."""
     for_link: Literal["off", "measured"] = "off"
-    """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that `gcs fly`
-    measures before the flight, or that a log shows (`--links-of`). `criteria` and `string_peak_max` hold at their
-    delays. With `dynamics = "autopilot"` the file must give the `response`."""
+    """`measured`: the gains of the inclusion principle, and whether to predict, are chosen for the links as `gcs fly`
+    measures them before the flight, or as a log shows them (`--links-of`). `criteria` and `string_peak_max` then hold
+    at the measured delays. With `dynamics = "autopilot"` the file must give the `response`."""
     link_headroom: Annotated[float, Field(ge=0, lt=1)] = 0.3
     """With `for_link`: the headroom to keep at the worst delay of the measured links."""
 
@@ -206,8 +206,8 @@ class Safety(Part):
     """A vehicle that does not hear its ground station for this long enters its failsafe and may take commands from
     another."""
     ready_patience_s: Annotated[float, Field(gt=0, le=360)] = 120.0
-    """How long a vehicle with an autopilot may take until it takes set-points in the air, from its first heartbeat or,
-    if it is never heard, from the start. Then the others fly without it."""
+    """Time that a vehicle with an autopilot has to become ready for set-points in the air, from its first heartbeat or,
+    if it is never heard, from the start. After that, the others fly without it."""
     spacing_error_limit_m: Positive = 1000.0
     """A larger spacing error ends the flight; the verdict is then `unstable`."""
     collision_distance_m: NotNegative = 5.0
@@ -227,7 +227,7 @@ class Monitor(Part):
     critical_headroom: Headroom = 0.15
     """A vehicle with less headroom is in CRITICAL, and the station acts."""
     hysteresis: NotNegative = 0.05
-    """A mode is left again when the headroom exceeds its threshold by this much."""
+    """A mode ends when the headroom exceeds its threshold by this much."""
     window_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """The monitor judges the 90th percentile of the loop delay over the ticks in this window."""
     hold_s: NotNegative = 0.3
@@ -237,16 +237,16 @@ class Monitor(Part):
     blend_s: Positive = 1.0
     """How long a change of gains takes."""
     time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (1.0, 2.0, 4.0)
-    """The gain schedule: the design slowed down in time by each factor. If vehicles respond at once, it multiplies the
-    delay margin."""
+    """The gain schedule: the design slowed down in time by each factor. If vehicles respond at once, the factor also
+    multiplies the delay margin."""
     open_factor: Factor = 1.5
-    """When even the slowest gains have too little headroom, every spacing is multiplied by this."""
+    """Factor on every spacing when even the slowest gains have too little headroom."""
     open_s: Positive = 10.0
     """How long opening the formation takes."""
 
 
 class ClockJump(Part):
-    """The boot clock of every vehicle jumps, as in a simulator that cannot keep up."""
+    """A jump of every vehicle's boot clock, as in a simulator that cannot keep up."""
 
     at_s: Positive
     """Time since the vehicles were started."""
@@ -258,20 +258,20 @@ class Autopilot(Part):
     """A simulated multicopter, with `dynamics = "autopilot"`: how it starts, and how it responds to set-points.
 
     It stands on the ground at its position until it is commanded to take off. The acceleration it aims at is that of
-    the set-point plus `velocity_gain_1_s` times its velocity error; its actual acceleration follows with a first-order
-    lag.
+    the set-point plus `velocity_gain_1_s` times its velocity error; its actual acceleration follows by one of the
+    models of `[response]`, by default a first-order lag.
     """
 
     flavour: Flavour = "ardupilot"
     """Whether it has the modes, messages and rules of ArduCopter or of PX4."""
     lag_s: Positive = 0.15
-    """Time constant of that lag."""
+    """Time constant of the lag."""
     velocity_gain_1_s: Positive = 2.0
     """Gain from velocity error to acceleration."""
     dead_time_s: DeadTime = 0.0
     """Dead time before the lag, as in `[response]`."""
     natural_frequency_rad_s: Positive | None = None
-    """Makes the response one of second order, as in `[response]`."""
+    """Selects the second-order model, as in `[response]`."""
     acceleration_max_m_s2: Positive = 5.0
     """Maximum acceleration."""
     jerk_max_m_s3: Positive | None = None
@@ -279,7 +279,7 @@ class Autopilot(Part):
     speed_max_m_s: Positive = 12.0
     """Maximum horizontal speed."""
     drag_1_m: NotNegative = 0.0
-    """Deceleration by the air, divided by the square of the horizontal speed."""
+    """Drag coefficient: the deceleration by the air, divided by the square of the horizontal speed."""
     climb_max_m_s: Positive = 2.5
     """Maximum climb rate."""
     telemetry_after_s: NotNegative = 1.0
@@ -289,11 +289,11 @@ class Autopilot(Part):
     arming_refusals: Annotated[int, Field(ge=0, le=1000)] = 0
     """How many arming requests it refuses after `ready_after_s`."""
     origin_spread_m: NotNegative = 20.0
-    """The origin of each vehicle's local frame is drawn within this distance of the common one, north and east."""
+    """Each vehicle's local frame has an origin drawn within ± this distance of the common one: north, east and up."""
     clock_jumps: tuple[ClockJump, ...] = ()
     """Jumps of the boot clock."""
     sitl: Sitl = Sitl()
-    """Clock errors as those of autopilots in SITL."""
+    """Clock errors of autopilots in SITL."""
 
 
 class Scenario(Part):
@@ -306,17 +306,17 @@ class Scenario(Part):
     duration_s: Annotated[float, Field(gt=0, le=86400)]
     """How long the formation is flown."""
     altitude_m: NotNegative = 1000.0
-    """Altitude above the origin of every vehicle that has none of its own."""
+    """Altitude above the origin, for vehicles without one of their own."""
     vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=MOST_VEHICLES)]
     """The formation: one tree, whose root is the leader."""
     nominal_velocity: tuple[NominalVelocity, ...] = ()
-    """The formation's velocity over time, as steps in order of time; needed without `course.waypoints_ne_m`."""
+    """The formation's velocity over time, as steps in order of time; required without `course.waypoints_ne_m`."""
     course: Course = Course()
     """Smooth courses, offsets that turn with the course, and a leader flown by somebody else."""
     formation_changes: tuple[FormationChange, ...] = ()
     """Changes of offsets in flight, in order of time."""
     limits: Limits = Limits()
-    """What the vehicles can do."""
+    """Limits of the vehicles' motion."""
     rates: Rates = Rates()
     """How often the station and the vehicles compute and send."""
     control: Control = Control()
@@ -328,7 +328,7 @@ class Scenario(Part):
     clocks: Clocks = Clocks()
     """The vehicles' boot clocks."""
     safety: Safety = Safety()
-    """Time-outs and limits."""
+    """Timeouts and limits."""
     monitor: Monitor = Monitor()
     """When and how the station acts on a shrinking headroom."""
     dynamics: Dynamics = "double_integrator"
@@ -342,11 +342,11 @@ class Scenario(Part):
     response: Response | None = None
     """How the vehicles respond to set-points, if that is known beforehand."""
     disturbance: Disturbance | None = None
-    """What pushes the vehicles in flight: wind, gusts, or a disturbance that depends on the formation's errors."""
+    """Pushes on the vehicles in flight: wind, gusts, or a disturbance that depends on the formation's errors."""
     navigation: Navigation | None = None
-    """Errors of what the vehicles report."""
+    """Errors of the positions and velocities that vehicles report."""
     at_end: Literal["hold", "land"] = "hold"
-    """What vehicles with an autopilot are commanded to do when the flight ends."""
+    """Command to vehicles with an autopilot when the flight ends."""
     code: SkipJsonSchema[tuple[CodeFile, ...]] = ()
     """No key: the Python files that other keys name, filled in when the scenario is read."""
 
@@ -402,7 +402,7 @@ class Scenario(Part):
 
     @property
     def target_hz(self) -> float:
-        """How often each vehicle is asked for its active target; 0 for never."""
+        """Rate at which each vehicle is asked for its active target; 0 for never."""
         if self.control.prediction == "off" or self.control.loop == "onboard":
             return 0.0  # on board, targets do not show which set-point acted
         return min(self.rates.target_hz, self.rates.telemetry_hz)

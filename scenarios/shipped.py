@@ -1,4 +1,4 @@
-"""The scenarios that ship with the package, by name, and new ones: a copy of one of these, or columns of vehicles."""
+"""Shipped scenarios by name, and new ones: a copy of a shipped one, or columns of vehicles."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -15,7 +15,7 @@ Vector = tuple[float, float]
 _SAMPLES = 400
 """Points of a change at which its acceleration and jerk are evaluated to find the largest."""
 _SPARE = 1.0001
-"""Factor on the duration of a change: between these points values are larger by less than one part in 10 000."""
+"""Factor on the duration of a change: between these points values exceed the largest by less than 1 in 10 000."""
 
 
 def smooth_step(x: float) -> tuple[float, float, float]:
@@ -65,7 +65,7 @@ class Change(NamedTuple):
         return self.from_s + self.duration_s
 
     def at(self, time_s: float) -> Heading:
-        """The nominal velocity at a time from `from_s` on; afterwards it stays."""
+        """The nominal velocity at a time from `from_s` on; constant after the change."""
         whole_s = self.duration_s or 1.0
         s, ds, dds = smooth_step((time_s - self.from_s) / whole_s) if self.duration_s else (1.0, 0.0, 0.0)
         return Heading(
@@ -77,7 +77,7 @@ class Change(NamedTuple):
         )
 
     def largest(self) -> tuple[float, float]:
-        """The largest acceleration (m/s²) and jerk (m/s³) of the change, over a duration other than zero."""
+        """The largest acceleration (m/s²) and jerk (m/s³) of the change, whose duration must not be zero."""
         most_m_s2 = most_m_s3 = 0.0
         for k in range(_SAMPLES + 1):
             x = k / _SAMPLES
@@ -128,7 +128,7 @@ class TooShortError(ValueError):
 def change_of(before: Heading, after_ne_m_s: Vector, from_s: float, bounds: Bounds) -> Change:
     """The shortest change to another velocity that keeps the bounds, turning the shorter way.
 
-    With a duration T every acceleration is in proportion to 1 / T and every jerk to 1 / T².
+    Over a duration T, every acceleration is proportional to 1 / T and every jerk to 1 / T².
     """
     heading_rad = atan2(after_ne_m_s[1], after_ne_m_s[0])
     turn_rad = remainder(heading_rad - before.heading_rad, tau)
@@ -147,7 +147,7 @@ def heading_of(velocity_ne_m_s: Vector) -> Heading:
 
 
 def tangent_m(turn: Change) -> float:
-    """Distance from a waypoint to where a turn at constant speed begins, and to where it ends.
+    """Distance from a waypoint to the start, and to the end, of a turn at constant speed.
 
     The turn is symmetric, so its chord halves the angle: tangent = chord / (2 cos(turn / 2)). The chord is the integral
     of V cos(heading - middle heading), here by Simpson's rule.

@@ -1,7 +1,7 @@
-"""UDP sockets read and written by kernels: no object is made for a datagram.
+"""Kernels that read and write UDP sockets without making an object for each datagram.
 
-The kernels call the C library with the layouts of 64-bit Linux. They use one array of 64-bit integers for all that
-passes between them: a `struct msghdr`, then an `iovec`, the ancillary data, a `sockaddr_in` and a `timespec`.
+They call the C library with the layouts of 64-bit Linux. One array of 64-bit integers holds all arguments and results:
+a `struct msghdr`, then an `iovec`, the ancillary data, a `sockaddr_in` and a `timespec`.
 """
 
 import errno
@@ -22,9 +22,9 @@ Ints = NDArray[np.int64]
 
 _LONGEST_DATAGRAM = 2048
 _MOST_DATAGRAMS, _MOST_BYTES = 4096, 1 << 20
-"""What is read at once; the rest waits in the sockets."""
+"""Limits of one read; the rest waits in the sockets."""
 NO_ADDRESS = -1
-"""In place of the number of an address: the socket is connected."""
+"""Stands for the number of an address where the socket is connected."""
 NS_PER_S = 1_000_000_000
 _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _EAGAIN, _REFUSED = errno.EAGAIN, errno.ECONNREFUSED
@@ -36,7 +36,7 @@ _48_BITS, _LONGEST_NS = 0xFFFFFFFFFFFF, 2**63 - 1
 
 
 class _External:
-    """A function of the C library, for kernels; Numba is asked for only when one is compiled."""
+    """A function of the C library, for kernels; Numba is imported only when a kernel with it is compiled."""
 
     def __init__(self, name: str, result: str, *arguments: str) -> None:
         self._name, self._result, self._arguments = name, result, arguments
@@ -57,7 +57,7 @@ _errno: Any = _External("__errno_location", "int32*")
 
 
 class Received(NamedTuple):
-    """A datagram with its receiving socket, the instant at which it reached this host, and its sender."""
+    """A datagram with its receiving socket, the time at which it reached this host, and its sender."""
 
     descriptor: int
     data: bytes
@@ -67,17 +67,17 @@ class Received(NamedTuple):
 
 @dataclass(slots=True)
 class Batch:
-    """Datagrams read together; whoever iterates over them gets objects.
+    """Datagrams read together; iterating over them yields `Received` objects.
 
-    The rows of `table` (5, n) say of each where it begins and ends in `stream`, the number of the address that it is
-    from, when it reached this host, and the descriptor of the socket.
+    The rows of `table` (5, n) are start and end of each datagram in `stream`, the number of the sender's address, the
+    time at which it reached this host, and the descriptor of the socket.
     """
 
     stream: Bytes
     table: Ints
     read_ns: int
     errors: int
-    """How many earlier datagrams met a closed port, or were refused otherwise."""
+    """Number of earlier datagrams that met a closed port or failed otherwise."""
 
     def __iter__(self) -> Iterator[Received]:
         data = self.stream.tobytes()
@@ -86,14 +86,14 @@ class Batch:
 
 
 def stamped(own: socket.socket) -> socket.socket:
-    """The socket, now without waiting and with the kernel's stamps of arrival."""
+    """The socket, made non-blocking, with timestamps of arrival by the operating system."""
     own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
     own.setblocking(False)
     return own
 
 
 class Reader:
-    """Reads sockets that are `stamped`, at most so many datagrams of each at once."""
+    """Reads sockets that are `stamped`, at most `most_of_each` datagrams from each at once."""
 
     def __init__(self, most_of_each: int = _MOST_DATAGRAMS) -> None:
         self._most = most_of_each
@@ -101,7 +101,7 @@ class Reader:
         self._emptied_ns = time.monotonic_ns()
 
     def read(self, descriptors: Sequence[int] | Ints) -> Batch:
-        """What has arrived at these sockets; no others may have datagrams that were not read."""
+        """The datagrams that have arrived at these sockets; no other sockets may have unread datagrams."""
         begin_ns, to_monotonic_ns = time.monotonic_ns(), -_offset_ns(self._buffers[2])
         count, end, errors, empty = _read(np.asarray(descriptors, np.int64), self._most, *self._buffers)
         read_ns = time.monotonic_ns()
@@ -115,7 +115,7 @@ class Reader:
 def write(stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> tuple[Ints, int, int]:
     """Send datagrams in order, from these sockets to the addresses with these numbers, or to their peers.
 
-    Returns when each was handed to the kernel, how many met a closed port, and how many another error.
+    Returns when each was handed to the operating system, how many met a closed port, and how many failed otherwise.
     """
     sent_ns = np.empty(len(begins), np.int64)
     return sent_ns, *_write(stream, begins, ends, descriptors, addresses, sent_ns, _words())
@@ -139,7 +139,7 @@ def address_of(number: int) -> tuple[str, int]:
 
 
 def joined(datagrams: Sequence[bytes]) -> tuple[Bytes, Ints]:
-    """Datagrams as one array, and where each begins, and the last ends."""
+    """Datagrams concatenated in one array, and where each begins and the last ends."""
     stream = np.frombuffer(bytearray().join(datagrams), np.uint8)
     return stream, np.cumsum([0, *map(len, datagrams)])
 
@@ -156,7 +156,7 @@ def _clock_ns(clock: int, words: Ints) -> int:
 
 @kernel
 def _offset_ns(words: Ints) -> int:
-    """That of the quickest of three readings of both clocks, as the process may be interrupted between them."""
+    """The offset by the quickest of three readings of both clocks, as the process may be interrupted between them."""
     quickest_ns, offset_ns = _LONGEST_NS, 0
     for _ in range(3):
         before_ns, real_ns = _clock_ns(_MONOTONIC, words), _clock_ns(_REALTIME, words)
@@ -197,9 +197,9 @@ def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints)
 
 @kernel
 def _to_monotonic(stamps_ns: Ints, offset_ns: int, emptied_ns: int, read_ns: int) -> None:
-    """Bring the stamps of datagrams, 0 where there is none, to the monotonic clock.
+    """Convert the stamps of datagrams, 0 where there is none, to the monotonic clock, in place.
 
-    They jump if the wall clock is set, but nothing arrived before the sockets were last empty.
+    The stamps jump if the wall clock is set, so they are clipped: nothing arrived before the sockets were last empty.
     """
     for k in range(len(stamps_ns)):
         stamp_ns = stamps_ns[k] + offset_ns if stamps_ns[k] else read_ns
@@ -210,7 +210,7 @@ def _to_monotonic(stamps_ns: Ints, offset_ns: int, emptied_ns: int, read_ns: int
 def _write(
     stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, sent_ns: Ints, words: Ints
 ) -> tuple[int, int]:
-    """Send datagrams; returns how many met a closed port, and how many another error."""
+    """Send datagrams; returns how many met a closed port, and how many failed otherwise."""
     base = words.ctypes.data
     refused = failed = 0
     for k in range(len(begins)):

@@ -1,4 +1,4 @@
-"""A process that wakes on time: for the drivers on the real clock, of the station and of the vehicles."""
+"""Makes a process wake on time, for the real-time drivers of the station and of the vehicles."""
 
 import contextlib
 import ctypes

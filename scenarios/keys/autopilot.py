@@ -12,8 +12,8 @@ DeadTime = Annotated[float, Field(ge=0, le=1)]
 class Response(Part):
     """How every vehicle responds to set-points. The control is designed for it.
 
-    Its velocity loop wants the acceleration w = a_set + gain (v_set - v), which its acceleration a follows with one of
-    three models. Without this part, model and values are identified in a manoeuvre before the formation flight.
+    A vehicle's velocity loop demands the acceleration w = a_set + gain (v_set - v); its acceleration a follows w by one
+    of three models. Without this part, model and values are identified in a manoeuvre before the formation flight.
 
     lag                 lag a'(t) = w(t) - a(t)
     lag with dead time  lag a'(t) = w(t - dead time) - a(t)
@@ -21,21 +21,21 @@ class Response(Part):
     """
 
     lag_s: Positive
-    """Time constant from wanted to real acceleration; of a second order, 2 damping / natural frequency."""
+    """Time constant from demanded to actual acceleration; with a natural frequency, 2 damping / natural frequency."""
     velocity_gain_1_s: NotNegative = 0.0
     """Gain from velocity error to acceleration."""
     dead_time_s: DeadTime = 0.0
     """Dead time before the lag."""
     natural_frequency_rad_s: Positive | None = None
-    """Natural frequency; makes the response one of second order."""
+    """Natural frequency; selects the second-order model."""
 
 
 class Sitl(Part):
-    """The clocks of vehicles that run in SITL. Everything is drawn from the seed, for each vehicle on its own."""
+    """Clock errors of vehicles that run in SITL, drawn from the seed for each vehicle separately."""
 
     timesync_back_s: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Largest time by which the stamps in TIMESYNC replies are too early; that of each reply is uniform from 0. An
-    ArduPilot dates them back by the time of their bytes on a serial port: up to 0.0035 at its default baud rate."""
+    """Largest time by which the stamps in TIMESYNC replies are too early; drawn uniformly from 0 for each reply.
+    ArduPilot backdates them by the time their bytes take on a serial port: up to 0.0035 at its default baud rate."""
     slip_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Mean time by which the boot clock falls behind whenever the simulator cannot keep up; exponential."""
     slip_every_s: Annotated[float, Field(gt=0, le=86400)] = 20.0

@@ -14,16 +14,16 @@ class Course(Part):
     """
 
     waypoints_ne_m: tuple[Position, ...] = ()
-    """Places that the leader's course leads past, in place of `nominal_velocity`. It starts at the first, rounds each
-    of the others on the inside, and goes straight on after the last."""
+    """Waypoints of the leader's course, in place of `nominal_velocity`. The course starts at the first, rounds each of
+    the others on the inside, and goes straight on after the last."""
     speed_m_s: Positive | None = None
     """Speed along the waypoints."""
     acceleration_max_m_s2: Positive | None = None
     """Largest acceleration of the nominal velocity. With it every change of the nominal velocity is smooth: heading and
     speed change by 10 x³ - 15 x⁴ + 6 x⁵ over the shortest time that keeps the bounds, and every vehicle is sent the
-    acceleration that this needs. Needed by waypoints."""
+    acceleration that this needs. Required with waypoints."""
     jerk_max_m_s3: Positive | None = None
-    """Largest rate at which that acceleration changes; without it only the acceleration bounds the changes."""
+    """Largest rate of change of that acceleration; if omitted, only the acceleration bounds the changes."""
     offsets: Literal["fixed", "heading"] = "fixed"
     """`fixed`: offsets are north and east. `heading`: they are forward and right of the nominal velocity's heading and
     turn with it; every vehicle is sent the acceleration that this needs."""
@@ -48,7 +48,7 @@ class ChangedOffset(Part):
 
 
 class FormationChange(Part):
-    """Offsets change smoothly, by 10 x³ - 15 x⁴ + 6 x⁵ over a given time.
+    """A smooth change of offsets, by 10 x³ - 15 x⁴ + 6 x⁵ over a given time.
 
     Every vehicle is sent the acceleration that this needs.
     """

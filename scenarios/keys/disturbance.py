@@ -1,4 +1,4 @@
-"""What disturbs a scenario's vehicles and what they report; `sim_vehicles.motion` implements it."""
+"""Disturbances of vehicles and errors of their reports; `sim_vehicles.motion` implements them."""
 
 from typing import Annotated
 
@@ -24,29 +24,29 @@ class Sector(Part):
     """A disturbance w = D e that depends on the true errors e, computed anew every control period (thesis eq. 3.20).
 
     e is (velocity error of the leader, then spacing error and velocity error of each other vehicle, those in front
-    first), w is added to its rates, and D acts alike on north and east. D(z) = norm * out(z) * direction * in(z) with
-    filters (c + 1/z) / (1 + c/z), which turn the phase of each error but not its size. `gcs stress --disturbance` finds
-    the worst one. Only with `dynamics = "double_integrator"` and one nominal velocity.
+    first), w is added to the derivative of e, and D is the same for north and east. D(z) = norm * out(z) * direction *
+    in(z) with all-pass filters (c + 1/z) / (1 + c/z), which shift the phase of each error but keep its amplitude.
+    `gcs stress --disturbance` finds the worst D. Only with `dynamics = "double_integrator"` and one nominal velocity.
     """
 
     norm_1_s: NotNegative
     """Largest ratio of |w| to |e|, m/s and m/s² to m and m/s."""
     direction: Annotated[tuple[tuple[Number, ...], ...], Field(min_length=1)]
-    """The matrix, scaled to norm one before use. Row: the error whose rate is disturbed. Column: the error that
+    """The matrix, scaled to norm one before use. Row: the error whose derivative is disturbed. Column: the error that
     disturbs it."""
     all_pass_in: tuple[AllPass, ...] = ()
-    """c of the filter of each column; 1 passes an error on as it is, as all do if omitted."""
+    """c of the filter of each column; 1 leaves an error unchanged. All are 1 if omitted."""
     all_pass_out: tuple[AllPass, ...] = ()
     """c of the filter of each row."""
 
 
 class Disturbance(Part):
-    """What pushes the vehicles in flight, beside their own acceleration. It does not count towards their limits."""
+    """Pushes on the vehicles in flight, besides their own acceleration; they do not count towards the limits."""
 
     wind_ne_m_s2: tuple[Number, Number] = (0.0, 0.0)
     """Steady acceleration of every vehicle, north and east."""
     gusts: Gusts | None = None
-    """Gusts on top of it."""
+    """Gusts on top of the wind."""
     sector: Sector | None = None
     """A disturbance that depends on the formation's errors."""
 

@@ -1,6 +1,6 @@
 """The emulated radio links of a scenario, as the file describes them; `sim_vehicles.links` implements them.
 
-A distribution of jitter is whole in `Jitter`: its keys, its draws and its least value.
+`Jitter` holds everything about a distribution of jitter: its keys, its draws and its lower bound.
 """
 
 from collections.abc import Iterator
@@ -30,9 +30,9 @@ class Jitter(Part):
     distribution: Literal["uniform", "normal", "exponential", "gamma", "trace"]
     """The distribution of the delay."""
     scale_s: Positive | None = None
-    """Scale of the distribution; needed by all but `trace`."""
+    """Scale of the distribution; required by all but `trace`."""
     shape: Positive | None = None
-    """Shape of the gamma distribution; needed by `gamma` only."""
+    """Shape of the gamma distribution; required by `gamma` only."""
     trace_file: str | None = None
     """File of measured delays, relative to the scenario file: one delay in s per line, or CSV with a column `delay_s`.
     It is read once, with the scenario, which then holds the delays themselves in `trace_s`."""
@@ -69,7 +69,7 @@ class Jitter(Part):
                 return min(self.trace_s or (0.0,))
 
     def contradictions(self, key: str) -> Iterator[Fault]:
-        """What contradicts itself in these keys; `key` is where they stand in the file."""
+        """Contradictions between these keys; `key` is their place in the file."""
         which, traces = f"with distribution {self.distribution}", (self.trace_file, self.trace_s)
         needed = {"gamma": ("scale_s", "shape"), "trace": ()}.get(self.distribution, ("scale_s",))
         possible = ("trace_file", "trace_s") if self.distribution == "trace" else needed
@@ -102,7 +102,7 @@ class LossBursts(Part):
 
 
 class DelayPoint(Part):
-    """The constant part of a link's delay at one time; linear between points. Two points at one time make a step."""
+    """A link's delay without jitter at one time; linear between points. Two points at one time make a step."""
 
     at_s: NotNegative
     """Link time of the point."""
@@ -139,7 +139,7 @@ class Link(Part):
     loss_bursts: LossBursts | None = None
     """Loss in bursts, in place of `loss_probability`."""
     duplicate_probability: Probability = 0.0
-    """Probability that a datagram which arrives does so twice. The second copy has its own jitter."""
+    """Probability that a datagram which arrives is duplicated. The copy has its own jitter."""
     corrupt_probability: Probability = 0.0
     """Probability that a datagram arrives with one to four of its bits flipped."""
     outages: tuple[Outage, ...] = ()
@@ -178,9 +178,9 @@ class Channel(Part):
     bits_per_byte: Annotated[int, Field(ge=8, le=16)] = 8
     """Bits on the air per byte of the datagram. A serial radio adds a start and a stop bit (8N1): 10."""
     queue_bytes: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Most bytes that wait, not counting the datagram being sent; unlimited if omitted."""
+    """Maximum number of bytes that wait, not counting the datagram being sent; unlimited if omitted."""
     queue_datagrams: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    """Most datagrams that wait, not counting the one being sent; unlimited if omitted."""
+    """Maximum number of datagrams that wait, not counting the one being sent; unlimited if omitted."""
     shared: bool = True
     """True: one channel for all vehicles whose links name it. False: each vehicle has a channel of its own."""
     half_duplex: bool = False

@@ -16,7 +16,7 @@ AircraftName = Annotated[str, Field(pattern=r"^jsbsim(:[A-Za-z0-9_-]+)?$")]
 
 Dynamics = Annotated[Literal["double_integrator", "autopilot"] | AircraftName | CodeName, one_fault("dynamics")]
 NO_LAW = {"controller": None, "linear": None}
-"""What changes in `[control]` for a method other than python."""
+"""Keys of `[control]` to clear for a method other than python."""
 BUILT_IN = "double_integrator", "autopilot"
 """Dynamics whose response is known, or identified by the station."""
 

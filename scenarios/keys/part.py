@@ -1,4 +1,4 @@
-"""What all parts of a scenario are made of: the base of a part, and numbers with bounds.
+"""Building blocks of every part of a scenario: the base class, and numbers with bounds.
 
 Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
 """
@@ -31,9 +31,9 @@ Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
 Fault = tuple[str, object, str]
-"""What is wrong with a scenario: a key, what was read, and what was wanted."""
+"""A fault of a scenario: its key, what was read, and what was wanted."""
 HELD_SHARE = 0.99
-"""With `control.execute_at`: the share of the set-points that arrive before they are to act."""
+"""With `control.execute_at`: the fraction of set-points that arrive before they are due."""
 PREDICTION_MAX_S = 10.0
 """Longest loop delay that the station predicts over."""
 
@@ -48,7 +48,7 @@ SystemId = Annotated[int, Field(ge=1, le=LARGEST_ID), AfterValidator(_in_a_netwo
 
 
 def one_fault(kind: LiteralString, **context: float) -> WrapValidator:
-    """One fault for a key of several types; pydantic reports one for each of them. `scenarios.places` words it."""
+    """One fault for a key of several types, where pydantic reports one per type. `scenarios.places` words it."""
 
     def validated(value: object, validate: ValidatorFunctionWrapHandler) -> object:
         try:

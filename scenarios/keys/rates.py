@@ -1,4 +1,4 @@
-"""How often the station and the vehicles speak."""
+"""Rates at which the station and the vehicles send."""
 
 from typing import Annotated
 
@@ -18,5 +18,5 @@ class Rates(Part):
     """TIMESYNC exchanges with each vehicle. More than `control_hz` counts as `control_hz`, because each control
     tick logs one round trip."""
     target_hz: Annotated[float, Field(ge=0, le=500)] = 10.0
-    """POSITION_TARGET_LOCAL_NED messages from each vehicle, which show what acted; with `control.prediction` only, and
-    never more than `telemetry_hz`. 0: none, and every set-point is assumed to act as it was sent."""
+    """POSITION_TARGET_LOCAL_NED messages from each vehicle, which show which set-point acts; with `control.prediction`
+    only, and never more than `telemetry_hz`. 0: none, and every set-point is assumed to act as it was sent."""

@@ -1,7 +1,4 @@
-"""Key files of MAVLink 2 signing: 32 secret bytes that nobody but their owner may read.
-
-KeyFileError(Exception)    a key file, or the file of timestamps beside it, cannot be used: one line
-"""
+"""Key files of MAVLink 2 signing: 32 secret bytes that only their owner may read."""
 
 import hashlib
 import os
@@ -15,11 +12,11 @@ _MOST_BYTES = 1024
 
 
 class KeyFileError(Exception):
-    """A key file cannot be used. The line names the file, and shows nothing of its contents."""
+    """A key file, or its file of timestamps, cannot be used. The text names the file but shows no contents."""
 
 
 class Key:
-    """The secret, kept out of whatever prints, logs or pickles objects."""
+    """The secret key. Printing and logging hide it, and it cannot be pickled."""
 
     __slots__ = ("secret",)
 

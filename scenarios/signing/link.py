@@ -1,7 +1,7 @@
 """MAVLink 2 signing: signs what one system sends over one link, and verifies what it receives there.
 
-This is a layer outside stations and vehicles. They get verified frames without signatures, so nothing else can change
-their state. After the MAVLink guide, "Message Signing".
+This layer lies outside stations and vehicles. They get verified frames without signatures, so nothing else can change
+their state. It follows the MAVLink guide, "Message Signing".
 
 Decisions that the guide leaves open:
 
@@ -49,8 +49,8 @@ class SignedLink:
     """One system's end of one link.
 
     `crc_extra` gives, for each message id, the byte that ends the checksummed data; `epoch_ns` is the time, in ns since
-    1970, at which the clock of `now_ns` is 0. Where several ends share one memory of timestamps, `owner` is a number
-    for this end: the vehicle's system id, or the station's network.
+    1970, at which the clock of `now_ns` is 0. Where several ends share one `Stamps`, `owner` is the number of this end:
+    the vehicle's system id, or the station's network.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class SignedLink:
         return WRONG if frame[2] else UNSIGNED
 
     def _staleness(self, frame: bytes, now_ns: int) -> str:
-        """Why a verified frame is too old, or "": then it is the newest of its stream from now on."""
+        """Why a verified frame is too old, or "", after which it is the newest of its stream."""
         stream = self._streams | frame[5] << 16 | frame[6] << 8 | frame[-13]
         timestamp = int.from_bytes(frame[-12:-6], "little")
         newest = self._stamps.known.get(stream, -1)
@@ -154,7 +154,7 @@ def _toggled(frame: bytes) -> bytes:
 
 
 class _Recent:
-    """The last accepted timestamps of a stream: at least REMEMBERED of them, if there were as many."""
+    """The last accepted timestamps of a stream: at least REMEMBERED of them, if there have been as many."""
 
     __slots__ = ("_after", "_newer", "_older")
 

@@ -1,7 +1,7 @@
-"""The newest signing timestamps, in memory that may be a file, so that replays are refused after a restart too.
+"""The newest signing timestamps, in memory that may be a mapped file, so that restarts do not let replays in.
 
-The file is mapped: a timestamp is stored as soon as it is accepted, and survives any end of the process. If the machine
-itself goes down, those of the last seconds may be lost.
+A timestamp is stored in the file as soon as it is accepted, and survives any end of the process. If the machine itself
+goes down, those of the last seconds may be lost.
 """
 
 import fcntl

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000
 GOODBYE_NS = NS_PER_S
-"""How long the program runs on after the last vehicle was told to shut down, so that its answer leaves the links."""
+"""Time the program runs on after the last vehicle was told to shut down, so that its answer leaves the links."""
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
@@ -241,7 +241,7 @@ class _Lines:
 
 @contextlib.contextmanager
 def _signals() -> Generator[list[int]]:
-    """While entered, the ending signals are appended to a list; under nohup SIGHUP is not one of them."""
+    """While entered, collect the signals that end the program in a list; under nohup SIGHUP is not among them."""
     caught: list[int] = []
     wanted = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

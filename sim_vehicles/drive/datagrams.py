@@ -1,4 +1,4 @@
-"""Datagrams from and to the vehicles of a fleet, as arrays: few of them are ever looked at one by one."""
+"""Datagrams to and from the vehicles of a fleet, as arrays: few are ever handled one by one."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ Datagram = tuple[int, bytes, int]
 
 @dataclass(slots=True)
 class Datagrams:
-    """Datagrams in order; whoever iterates over them gets tuples.
+    """Datagrams in order; iterating over them yields tuples.
 
-    The rows of `table` (4, n) say of each where it begins and ends in `stream`, the vehicle's row in the fleet, and the
-    time in ns. `system_ids` are those of the rows.
+    The rows of `table` (4, n) are start and end of each datagram in `stream`, the vehicle's row in the fleet, and the
+    time in ns. `system_ids` holds the system id of each row of the fleet.
     """
 
     stream: Bytes
@@ -33,7 +33,7 @@ class Datagrams:
 
 
 def datagrams_of(datagrams: Sequence[Datagram], rows: Mapping[int, int]) -> Datagrams:
-    """The same datagrams as arrays; `rows` are those of the system ids."""
+    """The same datagrams as arrays; `rows` maps system ids to rows of the fleet."""
     stream, ends = joined([data for _, data, _ in datagrams])
     numbers = [ends[:-1], ends[1:], [rows[key] for key, _, _ in datagrams], [time_ns for _, _, time_ns in datagrams]]
     return Datagrams(stream, np.array(numbers, np.int64), [*rows])

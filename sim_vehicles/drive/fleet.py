@@ -1,7 +1,7 @@
 """All vehicles of a scenario with their links, as one function of datagrams and time.
 
-Both the driver on real UDP and one on a virtual clock call `Fleet.step`; the same seed, start and datagrams give the
-same bytes at the same instants.
+The drivers on real UDP and on a virtual clock both call `Fleet.step`; the same seed, start and datagrams give the same
+bytes at the same times.
 """
 
 import heapq
@@ -50,7 +50,7 @@ class _Member:
 
 
 class FleetArrays(NamedTuple):
-    """What a kernel needs to run the usual events of a fleet."""
+    """The arrays on which a kernel runs the usual events of a fleet."""
 
     vehicles: Records
     links: Records
@@ -67,17 +67,17 @@ class Fleet:
     """The vehicles and links of a scenario.
 
     Vehicles do not affect each other, so each is brought up to date only when one of its datagrams can leave, in order
-    of that time and of system id. Nothing comes too late by this: every event carries its exact instant. There are
-    three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle, and a
-    disturbance may depend on the errors of all. Then events run in order of time; at one instant the station's
-    datagrams first enter their links, then the disturbance acts, then the vehicles by system id.
+    of that time and of system id. This delays nothing: every event carries its exact time. There are three exceptions:
+    in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle, and a disturbance may
+    depend on the errors of all. With any of these, events run in order of time; at equal times the station's datagrams
+    enter their links first, then the disturbance acts, then the vehicles by system id.
 
-    One call of a kernel (`vehicles.plain`) lets the station's datagrams enter, runs the usual events of all plain
-    vehicles and collects what leaves. The rest runs in Python, vehicle by vehicle: what is unusual for a plain one, and
-    all events of the others.
+    One kernel call (`vehicles.plain`) lets the station's datagrams enter, runs the usual events of all plain vehicles
+    and collects what leaves. Python runs the rest, vehicle by vehicle: the unusual events of plain vehicles, and all
+    events of the others.
 
-    `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
-    get only what could be verified.
+    `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and pass on to the
+    vehicles only what they could verify.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Fleet:
         self._waiting = np.zeros((count, 2), np.int64)
         self._acts_ns = np.zeros(count, np.int64)
         """When each vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
-        most = max(64, 2 * count)  # datagrams that leave at one time; of more, the kernel returns a part
+        most = max(64, 2 * count)  # datagrams that leave in one call; the kernel returns more of them in parts
         self._leaving, self._leaving_data = np.zeros((4, most), np.int64), np.zeros(most * FRAME_BYTES, np.uint8)
         self._edge = self._waiting, self._leaving, self._leaving_data
         self._entering: list[tuple[int, int, int, bytes]] = []
@@ -135,7 +135,7 @@ class Fleet:
 
     @property
     def next_event_ns(self) -> int:
-        """Until this instant in ns, `step` returns nothing unless datagrams arrive."""
+        """Until this time in ns, `step` returns nothing unless datagrams arrive."""
         return next_leaving_ns(*self._arrays()[:2])
 
     @property
@@ -164,7 +164,7 @@ class Fleet:
         return total
 
     def lost_share(self, *, up: bool) -> float:
-        """Fraction of the datagrams lost up, from vehicles, or down; those still under way do not count."""
+        """Fraction of datagrams lost on up links (from vehicles) or down links; those still under way do not count."""
         links = [member.up if up else member.down for member in self._in_rows]
         ended = sum(link.entered + link.counts["duplicated"] - link.under_way for link in links)
         return sum(link.dropped for link in links) / max(ended, 1)
@@ -183,9 +183,9 @@ class Fleet:
         return sorted(changes)
 
     def step(self, received: Datagrams | Sequence[Datagram], now_ns: int) -> Datagrams | list[Datagram]:
-        """The datagrams that leave the up links by now, with their exact instants, in order of time.
+        """The datagrams that leave the up links by now, with their exact times, in order of time.
 
-        `received` are datagrams of the station, with the instants at which each enters its vehicle's down link.
+        `received` are datagrams of the station, with the times at which each enters its vehicle's down link.
         """
         if self._links.zero_ns == NEVER_NS or self._external is not None:
             for _, data, time_ns in received:
@@ -201,7 +201,7 @@ class Fleet:
     def go_on(
         self, entering: Datagrams, entered: int, waiting: int, leaving: int, now_ns: int
     ) -> Datagrams | list[Datagram]:
-        """Finish a step that `step_all` has begun, which returned the three numbers."""
+        """Finish a step begun by `step_all`, which returned the three numbers."""
         while entered < len(entering):
             begin, end, row, time_ns = entering.table[:, entered].tolist()
             self._in_rows[row].down.send(entering.stream[begin:end].tobytes(), time_ns)
@@ -221,21 +221,21 @@ class Fleet:
 
     @property
     def is_usual(self) -> bool:
-        """Whether `step` does nothing before `step_all`, but for noticing when the time of the links begins."""
+        """Whether `step` does nothing before `step_all` except notice when the links' time begins."""
         return self._external is None and not self._in_order
 
     @property
     def knows_link_time(self) -> bool:
-        """Whether it is known when the time of the links began: by default at the station's first set-point."""
+        """Whether the zero of the links' time is known: by default, the station's first set-point."""
         return self._links.zero_ns != NEVER_NS
 
     def make_ready(self) -> None:
-        """See to it that kernels have random draws for some steps."""
+        """Make random draws ahead, enough for kernels to run some steps."""
         self._links.draw()
 
     @property
     def arrays(self) -> FleetArrays:
-        """What `step_all` works on; a step may replace parts of it, but not one by kernels alone."""
+        """The arrays of `step_all`. A step may replace some of them, unless it runs in kernels alone."""
         return FleetArrays(*self._arrays(), *self._edge)
 
     @property
@@ -250,19 +250,19 @@ class Fleet:
         return leave_all(vehicles, links, entries, frames, truth, self._leaving, self._leaving_data, now_ns)
 
     def _left(self, count: int) -> Datagrams:
-        """So many datagrams that the kernel let leave, in order of time and row."""
+        """The first `count` datagrams that the kernel let leave, in order of time and row."""
         table = self._leaving[:, :count]
         size = table[1, -1] if count else 0
         in_order = table.take(table[3].argsort(kind="stable"), axis=1)
         return Datagrams(self._leaving_data[:size].copy(), in_order, self.system_ids)
 
     def _arrays(self) -> tuple[Records, Records, Records, Bytes, Records, Records]:
-        """What the kernels work on."""
+        """The arrays of the kernels."""
         queues = self._links.queues
         return self._vehicles, queues.links, queues.entries, queues.frames, queues.draws, queues.truth
 
     def _run_waiting(self, count: int, now_ns: int) -> None:
-        """Bring the vehicles up to date that the kernel has left."""
+        """Bring up to date the vehicles that the kernel has left to Python."""
         for _, row in sorted(self._waiting[:count].tolist()):
             member = self._in_rows[row]
             if self._columns["plain"][row]:
@@ -319,7 +319,7 @@ class Fleet:
             self._plan(member)
 
     def _disturb(self, now_ns: int) -> None:
-        """Push the vehicles by what their true errors are now, until the next period."""
+        """Set each vehicle's push for the next period from the true errors now."""
         assert self._sector is not None
         crafts = {system_id: member.vehicle.craft for system_id, member in self._members.items()}
         for system_id, push in self._sector.pushes(lambda system_id: crafts[system_id].state_at(now_ns)).items():
@@ -350,7 +350,7 @@ class Fleet:
 
 
 def prepare(scenario: schema.Scenario) -> None:
-    """Fly plain vehicles of a scenario for seconds, logged and not, so that nothing is compiled in real time."""
+    """Compile the kernels before real time begins: fly plain vehicles of a scenario for seconds, logged and not."""
     plain = {"dynamics": "double_integrator", "links": Links()}
     for recorder in (None, MemoryRecorder()):
         fleet = Fleet(scenario.model_copy(update=plain), 0, recorder=recorder)

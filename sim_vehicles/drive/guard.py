@@ -9,7 +9,7 @@ from scenarios.signing.stamps import Stamps, open_stamps
 from sim_vehicles.services.mavlink import CRC_EXTRA
 
 LINK_ID = 0
-"""The link id in signatures; one serves, as each vehicle has one socket."""
+"""Link id in signatures. One is enough, as each vehicle has one socket."""
 
 
 def signed_links(key: Key, system_ids: Iterable[int], *, epoch_ns: int, stamps: Stamps) -> dict[int, SignedLink]:

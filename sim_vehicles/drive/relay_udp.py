@@ -12,7 +12,7 @@ from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.vehicles.shell import Change
 
 MOST_PEERS = 1000
-"""Most addresses from which vehicles are accepted; a restarted vehicle may have a new one."""
+"""Maximum number of addresses from which vehicles are accepted; a restarted vehicle may have a new one."""
 SILENCE_NS = 3 * NS_PER_S // 2
 """A vehicle silent for this long may have been restarted, and may send from another address."""
 

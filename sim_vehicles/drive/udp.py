@@ -1,7 +1,7 @@
 """Vehicles on real UDP, with one thread and one socket per vehicle.
 
-The kernel stamps what arrives, so the emulated down link begins when the datagram reached the host, not when this loop
-read it. Datagrams leave within some tens of microseconds of their due time.
+The operating system timestamps each arrival, so the emulated down link begins when the datagram reached the host, not
+when this loop read it. Datagrams leave within some tens of microseconds of their due time.
 """
 
 import resource
@@ -20,20 +20,20 @@ from scenarios.undisturbed import undisturbed
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
-"""How long before a due time the loop polls the clock instead of sleeping: with few vehicles, late wake-ups are most of
-the error. The second figure bounds the sum over all vehicles, to a tenth of a core at 50 Hz."""
+"""The loop busy-waits for this long before a due time, because with few vehicles late wake-ups are most of the error.
+The second figure bounds the sum over all vehicles: a tenth of a core at 50 Hz."""
 TOGETHER_NS = 1_000
-"""Between two wake-ups pass at least this times the number of vehicles; what is due by then is handled together. 250
-vehicles act and receive about 30,000 times a second."""
+"""Minimum time between two wake-ups, per vehicle; everything due by then is handled together. 250 vehicles act and
+receive about 30,000 times a second."""
 LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
 READ_OF_EACH = 16
-"""Most datagrams read from one socket before the vehicles act again, so that a flood cannot hold them up."""
+"""Maximum number of datagrams read from one socket before the vehicles act again: a flood cannot hold them up."""
 LATE_NS = 5_000_000
 """A datagram that leaves later than this is counted: the emulated link then differs from the scenario's."""
 
 _OTHER_FILES = 100
-"""Files that are open beside the sockets, and room for more."""
+"""Allowance for files open besides the sockets."""
 
 
 class Sockets:
@@ -71,7 +71,7 @@ class Sockets:
 
     def wait(self, until_ns: int) -> None:
         """Sleep until a time, or until a datagram has arrived."""
-        # select, because epoll rounds its time-outs up to whole milliseconds
+        # select, because epoll rounds its timeouts up to whole milliseconds
         spin_ns = min(LONGEST_SPIN_NS, SPIN_OF_ALL_NS // max(1, len(self._sockets)))
         together_ns = self._woken_ns + TOGETHER_NS * len(self._sockets)
         remaining_ns = max(until_ns, together_ns) - spin_ns - time.monotonic_ns()
@@ -83,7 +83,7 @@ class Sockets:
         self._woken_ns = time.monotonic_ns()
 
     def receive(self) -> Batch:
-        """What has arrived, at most `READ_OF_EACH` datagrams of each socket: the next wait ends at once for more."""
+        """The datagrams that have arrived, at most `READ_OF_EACH` per socket; for more, the next wait ends at once."""
         ready = self._epoll.poll(0, len(self._sockets))
         batch = self._reader.read([number for number, _ in ready])
         self.counters["receive_refused"] += batch.errors  # answers to what was sent while nobody listened
@@ -92,8 +92,8 @@ class Sockets:
     def send(self, stream: Bytes, table: Ints, addresses: Ints | None = None) -> None:
         """Send datagrams to addresses with these numbers, or to the sockets' peers; failures are counted.
 
-        The rows of `table` (4, n) say of each where it begins and ends in `stream`, from which socket, and when it is
-        due.
+        The rows of `table` (4, n) are start and end of each datagram in `stream`, the descriptor of the socket, and the
+        due time in ns.
         """
         begins, ends, descriptors, due_ns = table
         to = np.full(len(due_ns), NO_ADDRESS) if addresses is None else addresses
@@ -107,7 +107,7 @@ class Sockets:
             self.latest_ns = max(self.latest_ns, latest_ns)
 
     def send_each(self, datagrams: Sequence[tuple[bytes, int, int, tuple[str, int] | None]]) -> None:
-        """As `send`, of each its bytes, socket, due time and address, or None for the socket's peer."""
+        """As `send`, given the bytes, socket, due time and address of each; None as address is the socket's peer."""
         data, descriptors, due_ns, addresses = zip(*datagrams, strict=True) if datagrams else ((), (), (), ())
         stream, ends = joined(data)
         to = [NO_ADDRESS if address is None else number_of(address) for address in addresses]
@@ -115,7 +115,7 @@ class Sockets:
 
 
 class Ports:
-    """The vehicles' sockets, each connected to the station, so that datagrams of others are not accepted.
+    """The vehicles' sockets, each connected to the station, so that datagrams from others are not accepted.
 
     `station` is where the station listens to network 0; network k has the port k above. Raises OSError if an address
     cannot be used, or too few files may be open.
@@ -139,7 +139,7 @@ class Ports:
         self.receive()
 
     def receive(self) -> Datagrams:
-        """What has arrived, with the instants at which it reached this host."""
+        """The datagrams that have arrived, with the times at which they reached this host."""
         batch = self.sockets.receive()
         table = batch.table[:4]
         table[2] = self._rows[batch.table[4]]
@@ -154,7 +154,7 @@ class Ports:
 
 
 def _allow_open(files: int) -> None:
-    """See to it that this process may have so many files open, which is often limited to 1,024."""
+    """Raise this process's limit of open files, often 1,024, to at least `files` if it may be raised so far."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft < files and soft != resource.RLIM_INFINITY:
         most = files if hard == resource.RLIM_INFINITY else min(files, hard)
@@ -172,7 +172,7 @@ def run(
     with undisturbed():
         while True:
             sockets.wait(min(next_event_ns(), next_look_ns))
-            # Read the clock before the sockets, so that every datagram that came by then is among those received.
+            # Read the clock before the sockets, so that every datagram that arrived by then is among those received.
             now_ns = time.monotonic_ns()
             step(now_ns)
             if now_ns >= next_look_ns:

@@ -1,4 +1,4 @@
-"""What decides what happens to a datagram on a link: the link, the time and random draws.
+"""The fate of a datagram on a link, decided by the link's settings, the time and random draws.
 
 Each link has two random streams: one decides loss, duplication and corruption, the other the jitter. Every datagram
 takes the same number of draws from both, used or not. So more loss leaves the delays unchanged, and one link's traffic
@@ -18,8 +18,8 @@ from scenarios.schema import NS_PER_S
 
 MOST_FLIPS = 4
 BLOCK, BLOCKS = 128, 2
-"""Datagrams whose draws are made together, as numpy takes as long for one as for a hundred, and how many such blocks
-there are at a time: a new one is made while a part of the other is left."""
+"""Draws are made for BLOCK datagrams at once, because numpy takes as long for one as for a hundred. BLOCKS such blocks
+form a ring buffer: one is refilled while part of the other is left."""
 
 
 DRAW = np.dtype(
@@ -29,7 +29,7 @@ DRAW = np.dtype(
         ("jitter_ns", "i8"), ("duplicate_jitter_ns", "i8"),
     ]
 )  # fmt: skip
-"""All that is random about one datagram: uniform in [0, 1), except the jitter."""
+"""The random draws of one datagram: uniform in [0, 1), except the jitter."""
 Pairs = Sequence[tuple[int, int]]
 
 
@@ -40,14 +40,14 @@ def constant(link: link_keys.Link) -> bool:
 
 
 def in_outage(outages_ns: Pairs, time_ns: int) -> bool:
-    """Whether everything is lost that enters at a link time, given (from, until) of each outage."""
+    """Whether a link time lies in an outage, in which everything that enters is lost, given (from, until) of each."""
     return any(from_ns <= time_ns < until_ns for from_ns, until_ns in outages_ns)
 
 
 def delay_at(points: Pairs, time_ns: int) -> int:
-    """The delay in ns without jitter at a link time, given the points (link time, delay) in ns, at least one.
+    """Delay without jitter at a link time, in ns, given at least one point (link time, delay) in ns.
 
-    It is linear between points; at a step, it is the delay after it.
+    It is linear between points; at a step, it is the delay after the step.
     """
     if len(points) == 1:
         return points[0][1]
@@ -60,15 +60,15 @@ def delay_at(points: Pairs, time_ns: int) -> int:
 
 @kernel
 def drawn_bad(link: Record, draw: Record) -> bool:
-    """Whether a datagram finds a link in its bad state, from how the last one found it."""
+    """Whether a datagram finds a link in its bad state, given the state that the previous datagram found."""
     return draw.burst >= link.to_good if link.bad else draw.burst < link.to_bad
 
 
 @kernel
 def flips_of(probability: float, drawn: float) -> int:
-    """How many bits of a corrupted datagram are flipped, those at one place counted twice.
+    """Number of bits flipped in a corrupted datagram, counting one that is drawn twice as two.
 
-    Given that the draw is below the probability, it is uniform again.
+    A draw below the probability, divided by it, is again uniform in [0, 1).
     """
     return min(MOST_FLIPS, 1 + int(MOST_FLIPS * drawn / probability))
 
@@ -116,7 +116,7 @@ def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _De
 
 
 def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
-    """A trace in its own order, which keeps the correlation of neighbours; a duplicate takes the next delay."""
+    """Delays of a trace in their own order, which preserves their correlation; a duplicate takes the next delay."""
     at = int(rng.integers(len(trace_s)))
 
     def drawn(count: int) -> list[tuple[float, float]]:

@@ -1,8 +1,7 @@
-"""An emulated one-way radio link: a queue ordered by the time each datagram comes out.
+"""Emulated one-way radio links: each is a queue of datagrams ordered by due time.
 
-A datagram's fate is decided once, when it enters (`Link.send`): `fate` draws what happens to it, `queue` makes it
-happen, and `Channel` says how long it waits for bandwidth. A link that only delays by a constant draws no random
-numbers.
+A datagram's fate is decided once, when it enters (`Link.send`): `fate` draws it, `queue` applies it, and `Channel` says
+how long the datagram waits for bandwidth. A link that only delays by a constant draws no random numbers.
 """
 
 from collections import Counter, deque
@@ -24,7 +23,7 @@ from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.mavlink import message_id
 
 CAPACITY = 10_000
-"""Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
+"""Maximum number of datagrams under way: twice what 100 s of delay at 50 Hz need. Any more are dropped and counted."""
 
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
@@ -42,7 +41,7 @@ Entry = tuple[int, int, int, bytes, int, int]
 class Channel:
     """Limited bandwidth, of one link or shared by several: a drop-tail queue with one sender.
 
-    Sends one datagram at a time, in order of arrival; those of one instant in order of `send`.
+    Sends one datagram at a time, in order of arrival; at equal times, in order of the calls of `send`.
     """
 
     def __init__(self, channel: link_keys.Channel) -> None:
@@ -56,9 +55,9 @@ class Channel:
         self._waiting_bytes = 0
 
     def send(self, size_bytes: int, time_ns: int) -> tuple[int, int] | None:
-        """When the sending of a datagram begins and ends, or None if the queue is full.
+        """Start and end of a datagram's transmission, or None if the queue is full.
 
-        Successive calls must be in order of time.
+        Calls must be in order of time.
         """
         waiting = self._waiting
         while waiting and waiting[0][0] <= time_ns:
@@ -76,20 +75,20 @@ class Channel:
 
 
 class Link:
-    """Datagrams under way in one direction: a row of `Queues`.
+    """One direction of a vehicle's link: a row of `Queues`.
 
-    `counts` says by name what happened to them: `duplicated`, `corrupted`, and why they were dropped. Datagrams that
+    `counts` holds the numbers of datagrams `duplicated`, `corrupted`, and dropped for each reason. Datagrams that
     entered, plus duplicates, equal those that came out, were dropped, or are under way.
     """
 
     next_due_ns = Cell[int]()
     entered = Cell[int]()
     least_delay_ns = Cell[int]()
-    """No datagram takes less time than this."""
+    """Lower bound of every datagram's delay."""
     under_way = Cell[int]()
     """How many datagrams have neither come out nor been dropped."""
     plain = Cell[bool]()
-    """Whether kernels alone can run it: no channel limits it, and it is the same at all times."""
+    """Whether kernels alone can run it: it has no channel and no outages, and its delay without jitter is constant."""
     _drawn, _made = Cell[int](), Cell[int]()
     _barred, _corrupt = Cell[int](), Cell[float]()
 
@@ -117,7 +116,7 @@ class Link:
         self._queues, self._row = new_queues(1) if queues is None else queues, row
         self._columns = self._queues.columns
         self._long: dict[tuple[int, int], bytes] = {}
-        """Datagrams that are longer than a frame, by (number, whether it is the DUPLICATE)."""
+        """Datagrams longer than a frame, by (number, DUPLICATE or 0)."""
         self._stream = None
         if channel is not None or not constant(link):
             self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
@@ -144,7 +143,7 @@ class Link:
 
     @property
     def dropped(self) -> int:
-        """How many datagrams never come out."""
+        """Number of datagrams dropped, for whatever reason."""
         return sum(self.counts[FATES[fate]] for fate in (truth.LOST, truth.OUTAGE, truth.QUEUE_FULL, LINK_FULL))
 
     def send(self, data: bytes, time_ns: int) -> None:
@@ -170,7 +169,7 @@ class Link:
             self._keep(data, fate)
 
     def due(self, now_ns: int) -> list[Entry]:
-        """The datagrams that have come out by now, in order."""
+        """Remove and return the datagrams due by now, in order."""
         out: list[Entry] = []
         queues = self._queues
         while self.next_due_ns <= now_ns and (entry := take_due_at(queues.links, queues.entries, self._row, now_ns)):
@@ -196,7 +195,7 @@ class Link:
             self._made += BLOCK
 
     def make_ready(self) -> None:
-        """See to it that a datagram and a duplicate can enter: that there are draws, and room for them and records."""
+        """Make sure that a datagram and a duplicate can enter: that draws, free entries and free records are left."""
         self.draw()
         if not has_room(self._queues.entries):
             self._queues.grow()
@@ -204,7 +203,7 @@ class Link:
             self._queues.recorder.make_room()
 
     def _keep(self, data: bytes, fate: int) -> None:
-        """Keep a datagram that is longer than a frame, with the fate that it had."""
+        """Store a datagram longer than a frame, with its corruption and its duplicate, unless it is dropped."""
         if fate & DROPPED and not fate & DUPLICATE:
             return
         if fate & truth.CORRUPTED:
@@ -219,14 +218,14 @@ class Link:
 
 @kernel
 def row_of(number: int, kind: int) -> int:
-    """Where a vehicle's link is among the queues of a `LinkSet`, which numbers vehicles as they are asked for."""
+    """Row of a vehicle's link in the queues of a `LinkSet`, which numbers vehicles in the order of their first use."""
     return 2 * number + (kind == LINK_DOWN)
 
 
 class LinkSet:
     """The links of all vehicles of a scenario, with the channels they share and their common time.
 
-    `most` is how many vehicles can be asked for.
+    `most` is the maximum number of vehicles.
     """
 
     def __init__(
@@ -239,13 +238,13 @@ class LinkSet:
         self._pairs: dict[int, tuple[Link, Link]] = {}
         self._in_rows: list[Link] = []
         self.queues = new_queues(2 * most, recorder)
-        """Of all links, in the rows of `row_of`."""
+        """Queues of all links, indexed by `row_of`."""
         self.zero_ns = start_ns if scenario.links.times_from == "start" else NEVER_NS
         """Host time at which the links' time is 0; NEVER_NS before the flight has begun."""
 
     @property
     def have_channels(self) -> bool:
-        """Whether links wait for one another, so that datagrams must enter in order of time."""
+        """Whether links use channels, so that datagrams must enter in order of time."""
         return bool(self._channels)
 
     def of(self, system_id: int) -> tuple[Link, Link]:
@@ -263,7 +262,7 @@ class LinkSet:
         return int(self.queues.links["next_due_ns"].min())
 
     def due(self, now_ns: int) -> list[Link]:
-        """The links of which a datagram has come out by now."""
+        """The links with a datagram due by now."""
         due = self.queues.links["next_due_ns"] <= now_ns
         return [self._in_rows[row] for row in due.nonzero()[0].tolist()]
 
@@ -274,14 +273,14 @@ class LinkSet:
             self._in_rows[row].draw()
 
     def hear(self, data: bytes, time_ns: int) -> None:
-        """Look for the station's first set-point, which begins the flight and the links' time."""
+        """Begin the flight and the links' time, if this is the station's first set-point."""
         if is_set_point(data) and time_ns < self.zero_ns:
             self.zero_ns = time_ns
             for link in self._in_rows:
                 link.zero_ns = time_ns
 
     def counters(self) -> Counter[str]:
-        """What happened on all links: `link_up_lost` and so on, as in Link.counts."""
+        """Counts of all links: `link_up_lost` and so on, as in Link.counts."""
         total: Counter[str] = Counter()
         for up, down in self._pairs.values():
             total.update({f"link_up_{name}": count for name, count in up.counts.items()})

@@ -1,7 +1,7 @@
-"""The datagrams under way on links, in kernels: what enters, what happens to it, and what comes out when.
+"""Kernels for the datagrams under way on links: how they enter, their fate, and when they come out.
 
-The datagrams of all links lie in one pool of entries. Each link's are a list in order of the time when they come out,
-those of one time in order of entry. Entry 0 is none; its `after` begins the list of free entries.
+The datagrams of all links share one pool of entries. Those of one link form a linked list ordered by due time, and by
+order of entry at equal times. Entry 0 is a sentinel; its `after` is the head of the list of free entries.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ LINK = np.dtype(
 ENTRY = np.dtype(
     [
         ("due_ns", "i8"), ("number", "i8"), ("entered_ns", "i8"), ("fate", "i8"), ("queued_ns", "i8"),
-        ("size", "i8"),  # in bytes; those of a datagram longer than FRAME_BYTES are kept elsewhere
+        ("size", "i8"),  # in bytes; a datagram longer than FRAME_BYTES is kept in `Link`
         ("before", "i8"), ("after", "i8"),
     ]
 )  # fmt: skip
@@ -65,19 +65,19 @@ class Queues:
     """The links of one simulation, a row each, and the pool of their datagrams, which grows as needed."""
 
     links: Records
-    """Of LINK."""
+    """Records of LINK."""
     entries: Records
-    """Of ENTRY."""
+    """Records of ENTRY."""
     frames: Bytes
     """The bytes of each entry, (k, FRAME_BYTES)."""
     draws: Records
-    """Of DRAW: the newest draws of each link, (n, BLOCKS * BLOCK); draw k is in column k modulo their number."""
+    """Records of DRAW, (n, BLOCKS * BLOCK): a ring buffer for each link; draw k is in column k modulo its length."""
     columns: Columns
-    """Of `links`."""
+    """Columns of `links`."""
     recorder: Recorder | None
-    """Where what happens is recorded."""
+    """Records what happens, if given."""
     truth: Records
-    """Of the recorder."""
+    """Rows of the recorder."""
 
     def grow(self) -> None:
         """Double the pool."""
@@ -89,7 +89,7 @@ class Queues:
 
 
 def new_queues(count: int, recorder: Recorder | None = None) -> Queues:
-    """The queues of so many links that nothing has entered."""
+    """Empty queues for `count` links."""
     links, entries = np.zeros(count, LINK), np.zeros(_FIRST_SIZE, ENTRY)
     links["next_due_ns"], links["made"] = NEVER_NS, NEVER_NS
     _free_from(entries, 1)
@@ -98,7 +98,7 @@ def new_queues(count: int, recorder: Recorder | None = None) -> Queues:
 
 
 def _free_from(entries: Records, first: int) -> None:
-    """Put the entries from the first one on before the free ones."""
+    """Prepend the entries from `first` on to the list of free ones."""
     free = entries["after"][0]
     entries["after"][first:] = np.arange(first + 1, len(entries) + 1)
     entries["after"][-1], entries["after"][0] = free, first
@@ -150,11 +150,11 @@ def enter_later(
     link: Record, entries: Records, frames: Bytes, draws: Records, truth: Records, entry: int,
     time_ns: int, begin_ns: int, end_ns: int, delay_ns: int,
 ) -> int:  # fmt: skip
-    """Let a datagram enter whose sending begins and ends at these times, with this delay but for jitter.
+    """Let a datagram enter, given the start and end of its transmission and its delay without jitter.
 
     Returns its fate; with DUPLICATE and LINK_FULL together, only its duplicate was dropped.
     """
-    link.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
+    link.entered += 1  # also the order of datagrams that are due at the same time: first in, first out
     datagram = entries[entry]
     datagram.number, datagram.entered_ns, datagram.queued_ns = link.entered, time_ns, begin_ns - time_ns
     datagram.fate = PASSED
@@ -195,7 +195,7 @@ def enter_later(
 
 @kernel
 def _in_turn(link: Record, due_ns: int) -> int:
-    """When a datagram comes out that would be due at a time; without reordering it waits for the earlier ones."""
+    """Due time of a datagram: as given, but without reordering no earlier than those of the datagrams before it."""
     if link.reordering:
         return due_ns
     link.last_due_ns = max(due_ns, link.last_due_ns)
@@ -240,7 +240,7 @@ def _insert(link: Record, entries: Records, entry: int, due_ns: int) -> None:
 def record_datagram(
     truth: Records, link: Record, datagram: Record, frame: Bytes, time_ns: int, due_ns: int, fate: int
 ) -> None:
-    """Record in the truth that a datagram left a link at a time, or was dropped."""
+    """Record in the truth log that a datagram left a link at a time, or was dropped."""
     if len(truth) > 1:
         key, entered_ns = first_message(frame, datagram.size), datagram.entered_ns
         note(truth, link.kind, link.system_id, key, time_ns, entered_ns, due_ns, fate, datagram.queued_ns)
@@ -263,7 +263,7 @@ def take(link: Record, entries: Records) -> int:
 
 @kernel
 def take_in(entries: Records, frames: Bytes, data: Bytes, begin: int, size: int) -> int:
-    """A new entry with a part of these bytes."""
+    """A new entry that holds `size` bytes of `data`, from `begin`."""
     entry = new_entry(entries)
     entries[entry].size = size
     copy_bytes(frames[entry], 0, data, begin, min(size, FRAME_BYTES))
@@ -278,7 +278,7 @@ def enter_at(
     links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records, row: int, data: Bytes,
     time_ns: int, begin_ns: int, end_ns: int, delay_ns: int,
 ) -> int:  # fmt: skip
-    """Let a datagram enter the link in a row, see `enter_later`; NOT_READY if `ready` says so."""
+    """Let a datagram enter the link in `row` as `enter_later` does; NOT_READY unless the link is `ready`."""
     if not ready(links[row], entries, truth):
         return NOT_READY
     entry = take_in(entries, frames, data, 0, len(data))
@@ -289,6 +289,6 @@ def enter_at(
 
 @kernel
 def take_due_at(links: Records, entries: Records, row: int, now_ns: int) -> int:
-    """Remove the first entry of the link in a row if it is due by now; 0 if none is."""
+    """Remove and return the first entry of the link in `row` if it is due by now, else return 0."""
     link = links[row]
     return take(link, entries) if link.under_way > 0 and link.next_due_ns <= now_ns else 0

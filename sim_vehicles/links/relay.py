@@ -1,6 +1,6 @@
 """The links of a scenario in front of other programs' vehicles, as one function of datagrams and time.
 
-A vehicle is known by the system id of its first frame; only headers are read. A vehicle gets the same links, random
+A vehicle is identified by the system id in its first frame; only headers are read. It gets the same links, random
 streams and truth log that it would have in a Fleet.
 """
 
@@ -42,7 +42,7 @@ def sender(data: bytes) -> int | None:
 
 
 def holds_key(data: bytes) -> bool:
-    """Whether SETUP_SIGNING, which is never passed on, may begin anywhere in a datagram: receivers skip stray bytes."""
+    """Whether a SETUP_SIGNING frame, which is never passed on, may begin anywhere: receivers skip stray bytes."""
     at = data.find(SETUP_SIGNING, 7)
     while at >= 0 and data[at - 7] != MAGIC_2:
         at = data.find(SETUP_SIGNING, at + 1)
@@ -59,7 +59,7 @@ class Relay:
         most = max(MOST_IN_NETWORK, len(scenario.vehicles))
         self._links = LinkSet(scenario, start_ns, recorder=recorder, most=most)
         self._entering: list[Passing] = []
-        """Datagrams received later than the last step's now: an earlier one may still be unread."""
+        """Datagrams stamped later than the last step: an earlier one may still be unread."""
 
     @property
     def counters(self) -> Counter[str]:
@@ -67,12 +67,12 @@ class Relay:
 
     @property
     def next_event_ns(self) -> int:
-        """Before this instant `step` returns nothing, unless datagrams arrive."""
+        """Before this time `step` returns nothing, unless datagrams arrive."""
         due_ns = self._links.next_due_ns
         return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
 
     def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
-        """The datagrams that leave the links by now, with their exact instants, in order of time."""
+        """The datagrams that leave the links by now, with their exact times, in order of time."""
         entering = self._entering
         for passing in received:
             heapq.heappush(entering, passing)

@@ -39,11 +39,11 @@ last two fields are 0.
 LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (as it left, so perhaps corrupted; 0xFFFFFF
 if it has none) entered the link at `entered_ns`, was due at `due_ns`, and left at `time_ns`. Upwards it was then handed
 to a socket (in virtual time, to the station); downwards the simulated vehicle took it. It waited `queued_ns` for the
-channel. `fate` is the sum of what happened to it, see FATES. With one of DROPPED it never left: due_ns and time_ns
-equal entered_ns. A duplicated datagram has two records; the copy's has DUPLICATE.
-PUSHED, CARRIED, POSITION_ERROR, VELOCITY_ERROR: a disturbance, in the units of `disturbances`, times 1e9; `entered_ns`
-and `due_ns` hold its north and east components, and `disturbances` reads them. From `time_ns` on the vehicle is pushed
-by an acceleration, or carried at a velocity. The state sampled with time_boot_ms `key` was reported with these errors.
+channel. `fate` combines the bits in FATES. With one of DROPPED it never left: due_ns and time_ns equal entered_ns. A
+duplicated datagram has two records; the copy's has DUPLICATE.
+PUSHED, CARRIED: from `time_ns` on the vehicle is pushed by an acceleration, or carried at a velocity. POSITION_ERROR,
+VELOCITY_ERROR: the state sampled with time_boot_ms `key` was reported with this error. In all four, `entered_ns` and
+`due_ns` hold the north and east components times 1e9, in the units of `disturbances`, which reads them.
 """
 
 _OLDER = np.dtype([(name, "u1" if name == "system_id" else DTYPE[name]) for name in DTYPE.names or ()])
@@ -64,18 +64,18 @@ FATES = {
 _MAGIC, _OLDER_MAGIC = b"UAVTRUE3", b"UAVTRUE2"
 _BATCH = 8192
 _OF_ONE_EVENT = 4
-"""At least as many records as one event of a vehicle or link makes."""
+"""Upper bound on the records that one event of a vehicle or link makes."""
 _PARTS = 1e9
 
 
 Row = tuple[int, int, int, int, int, int] | tuple[int, int, int, int, int, int, int, int]
-"""One record's values in the order of DTYPE; omitted, the last two are 0."""
+"""The values of one record in the order of DTYPE; the last two are 0 if omitted."""
 NOT_RECORDED: Records = np.zeros(1, DTYPE)
-"""In place of `Recorder.rows` where nothing is recorded."""
+"""Stands in for `Recorder.rows` where nothing is recorded."""
 
 
 class Recorder:
-    """The records of one simulation, from kernels and one by one, handed on in batches.
+    """Collects the records of one simulation, from kernels and from Python, and writes them in batches.
 
     Kernels add theirs to `rows`. Row 0 is no record; its `queued_ns` counts the records after it.
     """
@@ -91,12 +91,12 @@ class Recorder:
         self.rows[count] = row if len(row) == 8 else (*row, PASSED, 0)
 
     def make_room(self) -> None:
-        """See to it that one event can be recorded."""
+        """Flush, unless one more event can be recorded."""
         if not can_record(self.rows):
             self.flush()
 
     def flush(self) -> None:
-        """Hand on the batch."""
+        """Write the batch, and begin a new one."""
         count = self._counts[0]
         self._write(self.rows[1 : 1 + count].copy())
         self._counts[0] = 0
@@ -185,7 +185,7 @@ def disturbance_row(kind: int, system_id: int, key: int, time_ns: int, north: fl
 
 
 def disturbances(truth: npt.NDArray[np.void], kind: int, system_id: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """When (ns, shape (k,)), and north and east, shape (k, 2), of a vehicle's disturbances of one kind.
+    """Times (ns), shape (k,), and components north and east, shape (k, 2), of a vehicle's disturbances of one kind.
 
     PUSHED in m/s², CARRIED in m/s, POSITION_ERROR in m, VELOCITY_ERROR in m/s.
     """
@@ -196,7 +196,7 @@ def disturbances(truth: npt.NDArray[np.void], kind: int, system_id: int) -> tupl
 def read_truth(path: Path) -> npt.NDArray[np.void]:
     """The complete records of a truth log, in the order written, as an array of DTYPE.
 
-    A log that a full disk cut off at its beginning holds none.
+    A log that a full disk cut off within its magic number has none.
 
     Raises ValueError if the file is not a truth log, or holds a record of an unknown kind.
     """

@@ -1,11 +1,11 @@
-"""What pushes a vehicle in flight besides its own acceleration: wind, gusts, and what the fleet adds.
+"""Pushes on a vehicle in flight, besides its own acceleration: wind, gusts, and what the fleet adds.
 
-A push is constant for an interval: an acceleration, and a velocity that carries the vehicle along but does not show in
-its own velocity. Half of the change of velocity is applied before the vehicle's own motion in that interval and half
-after it. This is exact for a double integrator within its limits, and of second order in 10 ms where motion depends on
-velocity.
+A push is constant over an interval: an acceleration, and a velocity that carries the vehicle along but does not show in
+its own velocity. Half of the velocity change is applied before the vehicle's own motion in the interval and half after
+it. This is exact for a double integrator within its limits; where motion depends on velocity, the error is of second
+order in the interval, which gusts limit to 10 ms.
 
-Gusts are a first-order process with the exact stationary variance, drawn every `STEP_NS` and held. Their instants count
+Gusts are a first-order process with the exact stationary variance, drawn every `STEP_NS` and held. Their times count
 from the start of the vehicles, so common gusts push all of them at once.
 """
 
@@ -27,7 +27,7 @@ Moved = TypeVar("Moved")
 
 
 class Push(NamedTuple):
-    """A constant acceleration, and a velocity with which the vehicle is carried along."""
+    """A constant acceleration, and a velocity at which the vehicle is carried along."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0
@@ -41,7 +41,7 @@ Piece = tuple[float, float, float, float, float]
 
 
 class Gusts:
-    """The gusts of one vehicle, north and east, by the number of the step."""
+    """The gusts of one vehicle, north and east, by step number."""
 
     def __init__(self, gusts: disturbance.Gusts, seed: int, system_id: int) -> None:
         self._draw = draws_of(seed, 0 if gusts.common else system_id, Use.GUSTS)
@@ -68,7 +68,7 @@ class Gusts:
 
 
 class Air:
-    """All that pushes one vehicle. `add` sets what the fleet adds from now on."""
+    """Everything that pushes one vehicle. `add` sets what the fleet adds from now on."""
 
     def __init__(self, scenario: Scenario, system_id: int, start_ns: int, recorder: Recorder | None) -> None:
         found = scenario.disturbance or disturbance.Disturbance()
@@ -79,7 +79,7 @@ class Air:
         self._recorded: Push | None = None
 
     def add(self, push: Push) -> None:
-        """Add a push until the next call; the vehicle must be up to date."""
+        """Set what the fleet adds, until the next call; the vehicle must be up to date."""
         self._added = push
 
     def moved(
@@ -92,7 +92,7 @@ class Air:
         *,
         foreseen: bool = False,
     ) -> Moved:
-        """The motion at a later instant; `move` is the vehicle's own motion over a duration in s.
+        """The motion at a later time; `move` is the vehicle's own motion over a duration in s.
 
         `shift` adds changes of position (north, east) and velocity to a motion.
         """
@@ -102,7 +102,7 @@ class Air:
         return motion
 
     def pieces(self, from_ns: int, to_ns: int, *, foreseen: bool = False) -> Iterator[Piece]:
-        """The intervals of constant push, in order. They must be used up at once.
+        """The intervals of constant push, in order. They must be consumed at once.
 
         `foreseen`: a look ahead over an interval that will be computed again, so nothing is recorded or forgotten.
         """
@@ -116,7 +116,7 @@ class Air:
             from_ns = until_ns
 
     def _at(self, time_ns: int) -> tuple[Push, int]:
-        """What pushes the vehicle from an instant on, and until when."""
+        """The push on the vehicle from a time on, and until when it is constant."""
         (north, east), until_ns = self._wind, NEVER_NS
         if self._gusts is not None:
             number = (time_ns - self._start_ns) // STEP_NS

@@ -1,16 +1,16 @@
-"""How an aircraft with six degrees of freedom flies: a model of the package jsbsim, and its autopilot.
+"""Motion of an aircraft with six degrees of freedom: a model of the package jsbsim, and its autopilot.
 
-The autopilot follows the commanded acceleration w by way of a reference that an aircraft can fly:
+The autopilot filters the commanded acceleration w into a reference that an aircraft can fly:
 
     a_r'' = ω² (w - a_r) - 2 ζ ω a_r',   v_r' = a_r,   ω = 2 rad/s, ζ = 0.8
 
-Of a_r + k (v_r - v), k = 3 1/s, the component along the course sets the throttle, and the component across it the bank
-angle of a coordinated turn. The elevator holds the altitude, the rudder keeps the turn coordinated. How strongly each
-control acts on the model at this speed is measured before the flight. Gains are divided by that, so that one set of
-gains flies different models.
+It aims at a_r + k (v_r - v), k = 3 1/s. The component along the course sets the throttle, the component across it the
+bank angle of a coordinated turn. The elevator holds the altitude, the rudder keeps the turn coordinated. The
+effectiveness of each control at this speed is measured on the model before the flight. Gains are divided by it, so that
+one set of gains flies different models.
 
-Autopilot and model run every 10 ms, with the mean of what was commanded since. In between, and when looking ahead, the
-acceleration is held. Vectors in the plane are complex numbers, north + j east.
+Autopilot and model run every 10 ms, with the mean of the commands since the last step. Between steps, and when looking
+ahead, the acceleration is held. Vectors in the plane are complex numbers, north + j east.
 """
 
 import cmath
@@ -30,10 +30,10 @@ STEP_S = 0.01
 FOOT_M = 0.3048
 _OMEGA_RAD_S, _DAMPING, _VELOCITY_1_S = 2.0, 0.8, 3.0
 _OWED_M_S = 0.5
-"""Most by which the velocity of the reference differs from that of an aircraft that cannot follow."""
+"""Largest difference of velocity between the reference and an aircraft that cannot follow it."""
 _BANK_1_S, _ROLL_1_S, _BANK_MAX_RAD = 5.0, 12.0, math.radians(60.0)
 _CLIMB_1_S, _CLIMB_1_S2 = 0.5, 0.05
-"""Climb rate per height to go, and per its integral."""
+"""Gains to climb rate, from the height error and from its integral."""
 _PITCH_1_S, _PITCH_RATE_1_S, _PITCH_RATE_1_S2 = 1.5, 4.0, 4.0
 _YAW_1_S, _SIDESLIP_1_S = 6.0, 1.0
 _NUDGES = (
@@ -43,7 +43,7 @@ _NUDGES = (
         for control, rate in (("aileron", "p"), ("elevator", "q"), ("rudder", "r"))
     ),
 )
-"""Each control, the quantity that it changes, for how long that is observed in s, and its unit in SI."""
+"""Each control, the quantity that it changes, how long that is observed in s, and its unit in SI."""
 _NUDGE = 0.05
 _FULL_TRIM = 1
 
@@ -59,7 +59,7 @@ class Attitude(NamedTuple):
 
 
 class Aircraft:
-    """The motion of one aircraft. What pushes it moves the air around it, and the aircraft with it."""
+    """The motion of one aircraft. A push moves the air around the aircraft, which is carried along."""
 
     def __init__(self, scenario: Scenario, own: Vehicle) -> None:
         """Raises ScenarioError if the package or the model is missing, or cannot fly level at the vehicle's speed."""
@@ -77,9 +77,9 @@ class Aircraft:
         self._reference = self._velocity
         self._height_sum = self._pitch_sum = 0.0
         self._air_place = self._air_velocity = 0.0j
-        """How far the air has moved, and how fast it moves."""
+        """Displacement and velocity of the air."""
         self._since_s, self._commanded = 0.0, 0.0j
-        """Time since the last step, and the integral of what was commanded since."""
+        """Time since the last step, and the integral of the commands over it."""
         self._shown: State | None = None
 
     def advance(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
@@ -164,7 +164,7 @@ class _FlightError(Exception):
 
 
 def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float) -> Any:
-    """A model of the package in steady level flight over a course."""
+    """A model of the package, trimmed to steady level flight on a course."""
     try:
         jsbsim: Any = import_module("jsbsim")  # has no type stubs
     except ModuleNotFoundError:
@@ -177,7 +177,7 @@ def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float)
     model.set_debug_level(0)
     try:
         model.load_model(name)
-        model.disable_output()  # the model's own, which would be written into the working directory
+        model.disable_output()  # the model's own output files, which would be written into the working directory
         model.set_dt(STEP_S)
         for key, value in (
             ("ic/h-sl-ft", altitude_m / FOOT_M),
@@ -201,7 +201,7 @@ def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float)
 
 @lru_cache(maxsize=16)
 def _effects(name: str, speed_m_s: float, altitude_m: float) -> dict[str, float]:
-    """The acceleration (m/s² or rad/s²) that full deflection of each control adds to steady flight."""
+    """Control effectiveness: the acceleration (m/s² or rad/s²) that full deflection adds to steady flight."""
     found: dict[str, float] = {}
     for control, rate, duration_s, unit in _NUDGES:
         ends: list[float] = []

@@ -1,10 +1,10 @@
-"""How a multicopter moves: its acceleration follows the commanded one with a lag, within limits.
+"""Motion of a multicopter: its acceleration follows the commanded one with a lag, within limits.
 
     w = a_set + g (v_set - v),  |w| clipped to the limit;   lag a' = w - a,   v' = a,   p' = v
 
-for north and east; g = 0 if no velocity is set. The air decelerates it by drag |v| v. Between set-points v_set
-integrates a_set if the autopilot does so. The climb rate follows its command with a lag of its own. RK4 integrates in
-steps of at most 10 ms.
+on each axis, north and east; g = 0 if the set-point has no velocity. The air decelerates it by drag |v| v. Between
+set-points v_set integrates a_set if the autopilot does so. The climb rate follows its command with a lag of its own.
+RK4 integrates in steps of at most 10 ms.
 """
 
 import math
@@ -16,9 +16,9 @@ from sim_vehicles.motion.lagged import Inner, followed, longest_step_s
 LONGEST_STEP_S = 0.01
 CLIMB_LAG_S = 0.3
 CLIMB_GAIN_1_S = 0.8
-"""Climb rate per remaining height of a take-off."""
+"""Gain from remaining height to climb rate in a take-off."""
 PLACE_GAIN_1_S = 0.3
-"""Speed per remaining distance of a flight to a place."""
+"""Gain from remaining distance to speed in a flight to a place."""
 YAW_RATE_MAX_RAD_S = 1.5
 
 
@@ -35,11 +35,11 @@ class Motion(NamedTuple):
     climb_m_s: float = 0.0
     yaw_rad: float = 0.0
     inner: Inner | None = None
-    """What its response remembers; None for a plain lag without a jerk limit."""
+    """Internal state of its response; None for a plain lag without a jerk limit."""
 
 
 class Target(NamedTuple):
-    """What the autopilot steers to. The velocity target integrates `growth` times the acceleration."""
+    """The target that the autopilot steers to. Its velocity integrates `growth` times its acceleration."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0
@@ -58,12 +58,12 @@ class Target(NamedTuple):
 
 
 def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s: float) -> tuple[Motion, Target]:
-    """The motion after `duration_s`, and the target with its velocity by then."""
+    """The motion and the target after `duration_s`; the target's velocity changes by then."""
     longest_s = LONGEST_STEP_S if motion.inner is None else longest_step_s(limits, LONGEST_STEP_S)
     steps = max(1, math.ceil(duration_s / longest_s))
     h = duration_s / steps
     for _ in range(steps):
-        if target.place_ne_m is not None:  # the velocity that leads there
+        if target.place_ne_m is not None:  # the velocity that leads to the place
             north, east = target.place_ne_m[0] - motion.north_m, target.place_ne_m[1] - motion.east_m
             gain = min(PLACE_GAIN_1_S, limits.speed_max_m_s / max(math.hypot(north, east), 1e-9))
             target = target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
@@ -110,7 +110,7 @@ def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) ->
 
 
 def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """The motion after a step: `plane` with its speed lessened and limited, and the new altitude and yaw."""
+    """The motion after a step: `plane` with its speed reduced by drag and limited, and the new altitude and yaw."""
     north, east, v_n, v_e, a_n, a_e = plane
     speed = math.hypot(v_n, v_e)
     if limits.drag_1_m:  # speed' = -drag speed^2
@@ -124,7 +124,7 @@ def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: sch
 
 
 def _step_remembering(motion: Motion, inner: Inner, target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """A step of a response with a memory: the acceleration wanted in the middle of the step is held during it."""
+    """A step of a response with internal state: the acceleration wanted in mid-step is held throughout the step."""
     north, east, v_n, v_e, a_n, a_e, *_ = motion
     half, gain = 0.5 * h, target.velocity_gain_1_s
     w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2

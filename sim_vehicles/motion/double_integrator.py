@@ -1,4 +1,4 @@
-"""How a double integrator moves: planar kinematics under feedback linearisation on board, with limits.
+"""Motion of a double integrator: planar kinematics under feedback linearisation on board, with limits.
 
     X' = V cos ψ,   Y' = V sin ψ,   ψ' = ω,   V' = a                                   (thesis eq. 2.2-2.4)
     (a, ω) = M(ξ) u,   M = [[cos ψ, sin ψ], [-sin ψ / V, cos ψ / V]]                   (thesis eq. 2.6)
@@ -7,7 +7,7 @@ u is the commanded acceleration (north, east). While u is constant and no limit 
 of a planar double integrator. Otherwise RK4 integrates the equations with M evaluated in every stage: the linearisation
 is continuous, not sampled.
 
-The motion runs in kernels, for every sample and every set-point of every vehicle.
+The motion is computed in kernels, as it is needed for every sample and every set-point of every vehicle.
 """
 
 import math
@@ -144,7 +144,7 @@ def shifted(state: State, north_m: float, east_m: float, north_m_s: float, east_
 
 @kernel
 def push_on(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
-    """Move a flying vehicle by an interval of constant push, a `Piece` of `air`."""
+    """Move a flying vehicle over an interval of constant push, a `Piece` of `air`."""
     t, half_north, half_east, north, east = piece
     state = shifted(state_of(vehicle), 0.0, 0.0, half_north, half_east)
     state = advance(state, command_of(vehicle), _bounds_of(vehicle), t)
@@ -186,7 +186,7 @@ def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State
 
 
 def limited(state: State, command: Command, bounds: Bounds) -> tuple[float, float]:
-    """The acceleration (north, east) that a command causes; the commanded one to the last digit if no limit binds."""
+    """The acceleration (north, east) that a command causes; exactly the commanded one if no limit binds."""
     _, _, yaw, speed = state
     _, _, turn_rate, along = rates(yaw, speed, command, bounds)
     cosine, sine, across = math.cos(yaw), math.sin(yaw), turn_rate * max(speed, bounds[0])

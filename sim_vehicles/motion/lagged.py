@@ -1,11 +1,11 @@
-"""How a multicopter's acceleration follows the one its velocity loop wants: limits, dead time, lag or second order.
+"""Response of a multicopter's acceleration to the one its velocity loop wants: limits, dead time, lag or second order.
 
     lag                 lag a'(t) = w(t) - a(t)
     lag with dead time  lag a'(t) = w(t - T) - a(t)
     second order        a'' / omega_n^2 + lag a' = w - a
 
-for north and east. |w| is clipped to the acceleration limit, then the change of w to the jerk limit. Within a step w is
-held at its mean. The plain lag without a jerk limit is in `sim_vehicles.motion.copter`.
+on each axis, north and east. |w| is clipped to the acceleration limit, then the rate of w to the jerk limit. Within a
+step w is held at its mean. The plain lag without a jerk limit is in `sim_vehicles.motion.copter`.
 """
 
 import math
@@ -18,25 +18,25 @@ _Line = tuple[tuple[float, float, float], ...]
 
 
 class Inner(NamedTuple):
-    """What a response remembers beside velocity and acceleration."""
+    """Internal state of a response besides velocity and acceleration."""
 
     aimed_m_s2: Vector = (0.0, 0.0)
     """The acceleration aimed at, within the limits."""
     jerk_m_s3: Vector = (0.0, 0.0)
-    """a', of a second order."""
+    """a' of a second-order response."""
     line: _Line = ()
     """Delay line: the accelerations aimed at in the last dead time, oldest first, as (duration in s, north, east)."""
 
 
 def inner_of(settings: schema.Autopilot) -> Inner | None:
-    """The memory of a response at rest; None for a plain lag without a jerk limit."""
+    """The internal state of a response at rest; None for a plain lag without a jerk limit."""
     if not (settings.dead_time_s or settings.natural_frequency_rad_s or settings.jerk_max_m_s3):
         return None
     return Inner(line=((settings.dead_time_s, 0.0, 0.0),) if settings.dead_time_s else ())
 
 
 def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
-    """The longest step: an acceleration that is aimed at in a step must not act within that step."""
+    """The longest integration step: an acceleration that is aimed at in a step must not act within that step."""
     fastest_s = math.inf if settings.natural_frequency_rad_s is None else 0.3 / settings.natural_frequency_rad_s
     return max(min(usual_s, settings.dead_time_s or usual_s, fastest_s, settings.lag_s), 1e-3)
 
@@ -44,7 +44,7 @@ def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
 def followed(
     inner: Inner, wanted_m_s2: Vector, acceleration_m_s2: Vector, settings: schema.Autopilot, h: float
 ) -> tuple[Inner, Vector, Vector]:
-    """The memory and the acceleration a step later, and the mean acceleration in the step."""
+    """Internal state and acceleration after a step, and the mean acceleration during it."""
     north, east = wanted_m_s2
     over = math.hypot(north, east) / settings.acceleration_max_m_s2
     if over > 1.0:
@@ -90,7 +90,7 @@ def _second_order(a: float, jerk: float, to: float, settings: schema.Autopilot, 
 
 
 def _shifted(line: _Line, h: float) -> tuple[_Line, Vector]:
-    """The delay line without its oldest `h` seconds, and their mean."""
+    """The delay line without its oldest `h` seconds, and the mean acceleration over those."""
     north = east = 0.0
     left_s, first = h, 0
     while first < len(line):

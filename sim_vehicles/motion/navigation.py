@@ -30,7 +30,7 @@ class Navigator:
         self._system_id, self._recorder = system_id, recorder
 
     def reported(self, position_m: Pair, velocity_m_s: Pair, time_ns: int, boot_ms: int) -> tuple[Pair, Pair]:
-        """Position and velocity as reported at an instant; calls are in order of time."""
+        """Position and velocity as reported at one time; calls must be in order of time."""
         drawn = self._draw.standard_normal((2, 4))
         since_s = 0.0 if self._at_ns is None else (time_ns - self._at_ns) / NS_PER_S
         fades = math.exp(-since_s / self._time_s)

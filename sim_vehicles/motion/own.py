@@ -5,10 +5,10 @@ The function is `step(state, command, dt_s, memory)`, which returns the state `d
     state    (4,): position north and east in m, velocity north and east in m/s
     command  (2,): the commanded acceleration north and east in m/s²
     dt_s     at most `LONGEST_STEP_S`; it may be as short as the time between two messages
-    memory   a dict of this vehicle's own, empty at the start; the only thing it may remember in
+    memory   a dict of this vehicle's own, empty at the start: the only place to keep anything between calls
 
-In a step that raises an exception, or returns anything but four finite numbers within FARTHEST_M and FASTEST_M_S, the
-vehicle keeps its velocity; such faults are counted.
+If a step raises an exception, or returns anything but four finite numbers within FARTHEST_M and FASTEST_M_S, the
+vehicle keeps its velocity and the fault is counted.
 """
 
 import copy
@@ -30,10 +30,10 @@ Floats = npt.NDArray[np.float64]
 
 
 class OwnMotion:
-    """The motion of one vehicle by a step function, and its memory."""
+    """The motion of one vehicle by its step function, with the function's memory."""
 
     def __init__(self, scenario: Scenario, on_fault: Callable[[str], None]) -> None:
-        """`on_fault` takes each fault in one line."""
+        """`on_fault` is called with each fault, as one line."""
         self._step = function_of(scenario, "dynamics")
         self._on_fault = on_fault
         self._memory: dict[str, Any] = {}
@@ -63,7 +63,7 @@ class OwnMotion:
     def _after(
         self, flown: Floats, command: Command, dt_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
     ) -> Floats | None:
-        """The state a step later; None if the model returns none that can be used."""
+        """The state a step later; None if the model raises an exception or returns an invalid state."""
         wanted = np.array(command[:2]) + command.velocity_gain_1_s * (np.array(command[2:4]) - flown[2:])
         try:
             with np.errstate(all="ignore"):

@@ -1,9 +1,9 @@
-"""A disturbance that depends on the true errors of the formation: w = D e, every control period (thesis eq. 3.20).
+"""A disturbance that depends on the formation's true errors: w = D e, every control period (thesis eq. 3.20).
 
 e is in the order of `scenarios.schema.Scenario.leader_first`: the leader's velocity error, then spacing error and
-velocity error of each other vehicle. w is added to the rates of e. The rate of a velocity error is an acceleration. The
-rate of a spacing error is the velocity of the vehicle in front minus its own, so a vehicle is carried along at the
-velocity at which the one in front is carried, minus w.
+velocity error of each other vehicle. w is added to the time derivative of e. For a velocity error, that is an
+acceleration. For a spacing error, it is the velocity of the vehicle in front minus the vehicle's own: each vehicle is
+carried along at the velocity at which the one in front is carried, minus w.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class SectorBound:
-    """The disturbance of a formation, with the memory of its filters."""
+    """The disturbance of a formation, with the state of its filters."""
 
     def __init__(self, scenario: Scenario) -> None:
         assert scenario.disturbance is not None
@@ -34,7 +34,7 @@ class SectorBound:
         self._out = AllPass(sector.all_pass_out, len(direction))
 
     def pushes(self, state_of: Callable[[int], State]) -> dict[int, Push]:
-        """What pushes each vehicle for a period, by system id, from the true states now."""
+        """The push on each vehicle for one period, by system id, from the true states now."""
         errors: list[Floats] = []
         states = {vehicle.system_id: state_of(vehicle.system_id) for vehicle in self._vehicles}
         for vehicle in self._vehicles:
@@ -57,7 +57,7 @@ class SectorBound:
 
 
 class AllPass:
-    """A filter (c + 1/z) / (1 + c/z) for each row of a signal (k, 2); c = 1 leaves it unchanged."""
+    """All-pass filters (c + 1/z) / (1 + c/z), one for each row of a signal (k, 2); c = 1 leaves a row unchanged."""
 
     def __init__(self, coefficients: tuple[float, ...], count: int) -> None:
         self._c = np.array(coefficients or (1.0,) * count)[:, np.newaxis]
@@ -65,7 +65,7 @@ class AllPass:
         self._before = self._after = np.zeros((count, 2))
 
     def passed(self, signal: Floats) -> Floats:
-        """The filtered signal, one period on: y_k = c x_k + x_{k−1} − c y_{k−1}."""
+        """Filter the signal of one more period: y_k = c x_k + x_{k−1} − c y_{k−1}."""
         out = self._c * signal + self._before - self._c * self._after
         self._before = signal
         self._after = np.where(self._still, signal, out)

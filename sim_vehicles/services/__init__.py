@@ -1,1 +1,1 @@
-"""What every MAVLink system needs: codec, clock, parameters, message schedule, whose commands it obeys."""
+"""Services that every MAVLink system needs: codec, clock, parameters, message schedule, command authority."""

@@ -1,4 +1,4 @@
-"""Whose commands a vehicle obeys: those of one ground station at a time."""
+"""Command authority: a vehicle obeys one ground station at a time."""
 
 from collections import Counter
 
@@ -15,11 +15,11 @@ _QUESTIONS = frozenset(
 
 
 class Authority:
-    """Remembers the station of a vehicle: the first system that commands it, until that has been silent for a time.
+    """Remembers a vehicle's station: the first system that commands it, until that system has been silent for too long.
 
     A system that only asks, listens or sends heartbeats does not become the station, and is always answered. While
-    there is no station, any system may set report rates; this does not make it the station, because display programs
-    set rates as soon as they start.
+    there is no station, any system may set report rates without becoming it: display programs set rates as soon as they
+    start.
     """
 
     station = Cell[int | None](NOBODY)
@@ -47,14 +47,14 @@ class Authority:
         return True
 
     def hears(self, source: int, time_ns: int) -> bool:
-        """Whether a ground station's heartbeat counts: it is from the station, or there is none."""
+        """Whether a ground station's heartbeat counts: it comes from the station, or there is no station."""
         if source == self.station:
             self._heard_ns = time_ns
             return True
         return self.station is None or time_ns - self._heard_ns > self._silence_ns
 
     def refusal(self, source: int, counters: Counter[str]) -> str:
-        """Count a refusal; returns the text that reports it at the first refusal of a system, else an empty string."""
+        """Count a refusal. Returns the text that reports it, or "" if this system was refused before."""
         counters["refused_not_the_station"] += 1
         if source in self._refused:
             return ""

@@ -13,21 +13,21 @@ PARTS = 1_000_000_000
 
 @kernel
 def boot_ns(start_ns: int, offset_ns: int, drift_ppb: int, host_ns: int) -> int:
-    """What a clock shows. Whole seconds are multiplied apart: times `PARTS`, nine of them would not fit 64 bits."""
+    """Boot time that a clock shows. Whole seconds are multiplied separately: no product then exceeds 64 bits."""
     whole, rest = divmod(host_ns - start_ns, PARTS)
     return offset_ns + (host_ns - start_ns) + whole * drift_ppb + rest * drift_ppb // PARTS
 
 
 @kernel
 def host_ns(start_ns: int, offset_ns: int, drift_ppb: int, boot_ns: int) -> int:
-    """The first host nanosecond at which a clock shows at least `boot_ns`."""
+    """The earliest host time (ns) at which a clock shows at least `boot_ns`."""
     whole, rest = divmod(offset_ns - boot_ns, PARTS + drift_ppb)
     return start_ns - whole * PARTS - rest * PARTS // (PARTS + drift_ppb)
 
 
 @dataclass(frozen=True)
 class BootClock:
-    """Converts host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back, without rounding drift."""
+    """Converts host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back in exact integers."""
 
     start_ns: int
     """Host time at which the clock shows `offset_ns`."""
@@ -45,7 +45,7 @@ class BootClock:
         return boot_ns(self.start_ns, self.offset_ns, self.drift_ppb, host_time_ns)
 
     def host_ns(self, boot_time_ns: int) -> int:
-        """The first host nanosecond at which the clock shows at least `boot_time_ns`."""
+        """The earliest host time (ns) at which the clock shows at least `boot_time_ns`."""
         return host_ns(self.start_ns, self.offset_ns, self.drift_ppb, boot_time_ns)
 
 

@@ -1,4 +1,4 @@
-"""Random numbers of the vehicles. Each use has a stream of its own, so that drawing more for one changes no other."""
+"""Random numbers of the vehicles. Each use has its own stream, so more draws for one use leave the others unchanged."""
 
 from enum import IntEnum, unique
 
@@ -7,7 +7,7 @@ import numpy as np
 
 @unique
 class Use(IntEnum):
-    """What random numbers are drawn for: the last word of the spawn key of their stream."""
+    """Uses of random numbers. The value is the last word of the spawn key of the use's stream."""
 
     CLOCK = 0
     LINK_UP = 1
@@ -21,7 +21,7 @@ class Use(IntEnum):
 
 
 def seeds_of(seed: int, system_id: int, use: Use) -> np.random.SeedSequence:
-    """The seeds of one stream of a scenario; those common to all vehicles have system id 0."""
+    """The seed sequence of one stream of a scenario; system id 0 stands for streams common to all vehicles."""
     return np.random.SeedSequence(seed, spawn_key=(system_id, use))
 
 

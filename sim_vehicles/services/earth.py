@@ -1,4 +1,4 @@
-"""The scenario's frame on the earth, taken as flat around the origin."""
+"""Conversion from the scenario's frame to latitude and longitude; the earth is taken as flat around the origin."""
 
 import math
 

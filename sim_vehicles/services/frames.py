@@ -1,4 +1,4 @@
-"""MAVLink 2 frames of the frequent messages, read and made in place: bytes in an array of uint8.
+"""Reads and writes MAVLink 2 frames of the frequent messages in place, as bytes in arrays of uint8.
 
 All numbers are little-endian. A payload's trailing zeros are not sent.
 """
@@ -13,7 +13,7 @@ from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
 
 HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION, SETPOINT, TIMESYNC = 0, 32, 33, 84, 111
 EXTRA = {HEARTBEAT: 50, LOCAL_POSITION: 185, GLOBAL_POSITION: 104, SETPOINT: 143, TIMESYNC: 34}
-"""Their CRC_EXTRA."""
+"""CRC_EXTRA of each of these messages."""
 FRAME_BYTES = 280
 """The longest frame: 10 bytes of header, 255 of payload, 2 of checksum, 13 of signature."""
 PAYLOAD = 10
@@ -33,7 +33,7 @@ Frame = NDArray[np.uint8]
 
 
 def _crc_tables() -> NDArray[np.uint16]:
-    """The checksum's remainder of each byte, and of each with 1, 2 and 3 zeros behind it; short, to compile fast."""
+    """Tables for slicing by four: the CRC of each byte followed by 0 to 3 zero bytes; only four, to compile fast."""
     remainder, tables = np.arange(256), []
     for _ in range(4):
         for _ in range(8):
@@ -46,15 +46,15 @@ _CRC = _crc_tables()
 _EXTRAS = np.array([EXTRA.get(number, NONE) for number in range(256)])
 
 
-# Numba compiles a kernel anew for every constant that it is called with, so these get none where that can be avoided.
+# Numba recompiles a kernel for every constant argument, so the kernels below get none where that can be avoided.
 
 
 @kernel
 def checksum(frame: Frame, end: int, extra: int) -> int:
-    """CRC-16/MCRF4XX of a frame up to the end of its payload, without its first byte, and of its CRC_EXTRA."""
+    """CRC-16/MCRF4XX of a frame from its second byte to the end of its payload, followed by its CRC_EXTRA."""
     crc, k = 0xFFFF, 1
     while k + 4 <= end:
-        # a sum of four remainders, which a processor looks up at once
+        # four independent table look-ups, which a processor does in parallel
         low, high = (crc ^ frame[k]) & 0xFF, (crc >> 8 ^ frame[k + 1]) & 0xFF
         crc = int64(_CRC[3, low] ^ _CRC[2, high] ^ _CRC[1, frame[k + 2]] ^ _CRC[0, frame[k + 3]])
         k += 4
@@ -90,7 +90,7 @@ def read_uint16(frame: Frame, at: int) -> int:
 
 @kernel
 def read_int64(frame: Frame, at: int, count: int) -> int:
-    """An integer of which this many bytes are sent; the others are zero."""
+    """An integer of `count` bytes; the bytes that were not sent are zero."""
     value = 0
     for k in range(count):
         value |= int(frame[at + k]) << 8 * k
@@ -116,7 +116,7 @@ def _put_float(frame: Frame, at: int, value: float) -> None:
 
 @kernel
 def finish(vehicle: Record, frame: Frame, extra: int) -> int:
-    """Complete a vehicle's next frame that has its message id and its whole payload, whose size is in place.
+    """Complete a vehicle's next frame, which already has its message id, payload and payload size.
 
     Returns the size of the frame.
     """
@@ -177,7 +177,7 @@ def global_position(
 
 @kernel
 def clipped(value: float, largest: int) -> int:
-    """A whole number whose magnitude is at most the largest."""
+    """The value rounded to a whole number and clipped to ± `largest`."""
     return max(-largest, min(largest, round(value)))
 
 

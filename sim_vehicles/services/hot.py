@@ -1,4 +1,4 @@
-"""What changes with every message of a vehicle, as one record for each: kernels and the vehicle's objects share it."""
+"""State of a vehicle that changes with every message, as one record per vehicle, shared by kernels and objects."""
 
 from typing import NamedTuple
 
@@ -9,15 +9,15 @@ from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.frames import GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION, TIMESYNC
 
 NOBODY = -1
-"""In place of the system id of a station."""
+"""Stands for the station's system id where there is no station."""
 NEVER_ASKED = -1
-"""In place of the `ts1` of a TIMESYNC request."""
+"""Stands for the `ts1` of the newest TIMESYNC request before there is one."""
 
 VEHICLE = np.dtype(
     [
         ("system_id", "i8"), ("wire_id", "i8"),
         ("plain", "?"),  # whether kernels may run its usual events: `sim_vehicles.vehicles.plain`
-        ("pushed", "?"),  # whether wind pushes it, too, so that the craft moves it before the kernels' events
+        ("pushed", "?"),  # whether a disturbance pushes it: the craft then moves it before each event that kernels run
         ("acts_ns", "i8"),  # when it next acts if nothing arrives
         ("sequence", "i8"),  # number of the next frame
         ("clock_start_ns", "i8"), ("clock_offset_ns", "i8"), ("clock_drift_ppb", "i8"),  # BootClock
@@ -34,27 +34,27 @@ VEHICLE = np.dtype(
         # the double integrator: its State at a time, its Command and its Bounds
         ("state_ns", "i8"), ("state", "f8", (4,)), ("command", "f8", (5,)), ("bounds", "f8", (4,)),
         ("altitude_m", "f8"),
-        # counters, until they are added to those of the vehicle
+        # counts that have not been added to the vehicle's counters yet
         ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"), ("timesync_replies", "i8"),
     ],
     align=True,
 )  # fmt: skip
 REPORTS = HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION, TIMESYNC
-"""The messages that vehicles report by themselves, in the order in which they are sent at one instant."""
+"""Messages that vehicles send unasked; those due at the same time are sent in this order."""
 COUNTED = ("setpoints", "heartbeats", "timesync_requests", "timesync_replies")
 
 
 class Place(NamedTuple):
-    """Where a vehicle's record is."""
+    """Location of a vehicle's record."""
 
     vehicles: Records
     columns: Columns
-    """Of `vehicles`."""
+    """Columns of `vehicles`."""
     row: int
 
 
 def new_vehicles(n: int) -> Records:
-    """Records of `VEHICLE` for n vehicles that have done nothing."""
+    """Initial records of `VEHICLE` for n vehicles."""
     vehicles = np.zeros(n, VEHICLE)
     vehicles["station"], vehicles["asked_ts1"] = NOBODY, NEVER_ASKED
     for name in ("acts_ns", "due_ns", "report_ns", "other_ns", "deadline_ns"):
@@ -63,5 +63,5 @@ def new_vehicles(n: int) -> Records:
 
 
 def place_in(vehicles: Records, row: int = 0) -> Place:
-    """A row of an array of `VEHICLE`."""
+    """The place of one row in an array of `VEHICLE`."""
     return Place(vehicles, Columns(vehicles), row)

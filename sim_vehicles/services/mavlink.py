@@ -1,8 +1,8 @@
-"""The vehicles' side of MAVLink 2: datagrams to messages, and messages to frames.
+"""MAVLink 2 codec of the vehicles: decodes datagrams into messages and encodes messages into frames.
 
-Each datagram is split into frames on its own: with pymavlink's stream parser a truncated frame would swallow the next
-datagram. The message tables are pymavlink's, and so is the decoder of all but the frequent messages. Refused frames are
-counted by reason; nothing is raised.
+Each datagram is parsed on its own: in pymavlink's stream parser a truncated frame would swallow the next datagram. The
+message tables are pymavlink's, as is the decoder of all but the frequent messages. Refused frames are counted by
+reason; nothing is raised.
 """
 
 import struct
@@ -59,7 +59,7 @@ SETUP_SIGNING = dialect.MAVLINK_MSG_ID_SETUP_SIGNING
 CRC_EXTRA: dict[int, bytes] = {
     number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items() if number != SETUP_SIGNING
 }
-"""The CRC_EXTRA of accepted messages; SETUP_SIGNING is not one: no key is accepted from a link."""
+"""CRC_EXTRA of the accepted messages. SETUP_SIGNING is not among them: no key is accepted from a link."""
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
 _DECODER = dialect.MAVLink(None)
@@ -109,7 +109,7 @@ class Timesync(NamedTuple):
 
 Heartbeat = dialect.MAVLink_heartbeat_message
 Asked = Setpoint | Command | Request
-"""A message that asks one vehicle for something."""
+"""A message addressed to one vehicle."""
 Read = Heartbeat | Timesync | Asked
 
 
@@ -199,7 +199,7 @@ def _append(messages: list[tuple[int, Read]], frame: bytes, checked: int, counte
 
 
 def _values(packing: struct.Struct, frame: bytes, checked: int) -> tuple[Any, ...]:
-    """A payload's values in wire order, with the trailing zeros that are not sent, without extension fields."""
+    """A payload's values in wire order: trailing zeros that were not sent are restored, extension fields dropped."""
     size = packing.size
     if checked - HEADER_BYTES >= size:
         return packing.unpack_from(frame, HEADER_BYTES)
@@ -219,7 +219,7 @@ _heartbeat_at, _timesync_at, _finish_at = at_row(frames.heartbeat), at_row(frame
 
 
 class Encoder:
-    """Makes one vehicle's frames, with sequence numbers in the order of the calls."""
+    """Encodes one vehicle's frames; sequence numbers follow the order of the calls."""
 
     sequence = Cell[int]()
 
@@ -235,7 +235,7 @@ class Encoder:
         return self._frame[:size].tobytes()
 
     def global_position(self, at: Condition) -> bytes:
-        """GLOBAL_POSITION_INT; zeros where there is no position, as ArduPilot sends them."""
+        """GLOBAL_POSITION_INT; without a position, latitude and longitude are zero, as ArduPilot sends them."""
         place = at.place_deg if at.has_position else (0.0, 0.0)
         size = _global_position_at(
             self._vehicles, self._row, self._frame,
@@ -280,7 +280,7 @@ class Encoder:
 
 
 def rehearsal(system_id: int) -> list[bytes]:
-    """Frames with which a station brings a vehicle into flight and commands it."""
+    """Frames with which a station prepares a vehicle for flight, and its first set-points."""
     system_id = wire_id(system_id)
     station = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     none = 0.0

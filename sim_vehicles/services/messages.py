@@ -1,4 +1,4 @@
-"""What ground stations ask of a vehicle, as pymavlink decodes it, and the messages that it answers and reports with."""
+"""Requests of ground stations, as pymavlink decodes them, and the messages with which a vehicle answers and reports."""
 
 import math
 from typing import NamedTuple, get_args
@@ -24,7 +24,7 @@ Mission = MissionList | MissionClear | MissionCount | MissionItem | MissionItemI
 """A request about the items of a mission, a fence or the rally points."""
 Request = ParameterList | ParameterRead | ParameterSet | TextRead | Mission | FileTransfer | DataStream | SetMode
 REQUESTS = frozenset(kind.id for kind in get_args(Request))
-"""Ids of the messages that are requests."""
+"""Message ids of all requests."""
 
 PARAMETER_VALUE = dialect.MAVLINK_MSG_ID_PARAM_VALUE
 NAMED_INT = dialect.MAVLINK_MSG_ID_NAMED_VALUE_INT
@@ -60,7 +60,7 @@ _INT16, _INT32 = 2**15 - 1, 2**31 - 1
 
 _FTP_TERMINATE, _FTP_RESET, _FTP_ACK, _FTP_NAK = 1, 2, 128, 129
 _FTP_OPENS = (3, 4, 14)
-"""List a directory, open a file to read, compute its checksum."""
+"""Opcodes that open something: list a directory, open a file for reading, compute a file's checksum."""
 _FTP_FILE_NOT_FOUND, _FTP_UNKNOWN_COMMAND = 10, 7
 
 
@@ -132,7 +132,7 @@ def home_position(
     place_deg: tuple[float, float] = (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG),
     local_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Message:
-    """HOME_POSITION, on the ground, on the globe and in the local frame."""
+    """HOME_POSITION on the ground: latitude and longitude, and position in the local frame."""
     place = *_degrees_e7(place_deg), clipped(ORIGIN_ALTITUDE_M * 1e3, _INT32)
     return dialect.MAVLink_home_position_message(*place, *local_ned_m, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
@@ -166,7 +166,7 @@ def named_int(boot_ms: int, name: str, value: int) -> Message:
 
 
 class Condition(NamedTuple):
-    """A vehicle's state at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
+    """A vehicle's state at one time, for GLOBAL_POSITION_INT and the messages of EXTRA."""
 
     time_boot_ms: int
     place_deg: tuple[float, float]

@@ -11,13 +11,13 @@ from sim_vehicles.services.mavlink import Encoder
 from sim_vehicles.services.messages import ParameterList, ParameterRead, ParameterSet
 
 LIST_INTERVAL_US = 20_000
-"""Time between two parameters of a list: with 37 bytes each, a third of a 57,600 bit/s radio."""
+"""Time between two parameters of a list. At 37 bytes each, a list takes a third of a 57,600 bit/s radio."""
 LONGEST_NAME = 16
 TIMEOUT_S = (0.1, 120.0)
 
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
 _PARAMETER_VALUE = struct.Struct("<4sHH16sB")
-"""PARAM_VALUE with the value as four bytes: an integer sent as its bytes may look like a NaN, which a float may not
+"""PARAM_VALUE with the value as four raw bytes: those of an integer may look like a NaN, which a float may not
 preserve."""
 
 
@@ -31,7 +31,7 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
-    """Whether it is an INT32, else a REAL32."""
+    """True: INT32. False: REAL32."""
 
     def __post_init__(self) -> None:
         assert self.name.isascii(), self.name
@@ -42,8 +42,8 @@ class Parameter:
 class Parameters:
     """The parameters of one vehicle, and its answers about them.
 
-    Values have the precision of float32, in which they are sent. `bytewise` says how the float field carries an INT32:
-    as its bytes (PX4), or converted to a float (ArduPilot).
+    Values have float32 precision, as on the wire. `bytewise` says how the float field carries an INT32: as its raw
+    bytes (PX4), or converted to a float (ArduPilot).
     """
 
     def __init__(self, known: Iterable[Parameter], *, bytewise: bool = False) -> None:
@@ -72,7 +72,7 @@ class Parameters:
             self._listed = 0
             return []
         name = message.param_id
-        if isinstance(message, ParameterRead) and message.param_index != -1:  # not by name
+        if isinstance(message, ParameterRead) and message.param_index != -1:  # by index
             name = self._names[message.param_index] if 0 <= message.param_index < len(self._names) else ""
         parameter = self._known.get(name)
         if parameter is None:
@@ -117,7 +117,7 @@ def _kind(whole: bool) -> int:
 
 
 def timeout(name: str, value_s: float) -> Parameter:
-    """A parameter that says how long a stream may be silent, in s."""
+    """A timeout parameter: how long a stream may be silent, in s."""
     low, high = TIMEOUT_S
     return Parameter(name, value_s, min(low, value_s), max(high, value_s))
 
@@ -128,7 +128,7 @@ def fixed(name: str, value: int) -> Parameter:
 
 
 def limit(name: str, value: float) -> Parameter:
-    """A limit of what the vehicle follows, which cannot be changed in flight."""
+    """A limit of the vehicle's motion, which cannot be changed in flight."""
     return Parameter(name, value, value, value)
 
 
@@ -165,4 +165,4 @@ ARDUPILOT_SETUP, PX4_SETUP = (
     [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
     for values in (_ARDUPILOT_VALUES, _PX4_VALUES)
 )
-"""They have no effect. Without them QGroundControl warns that frame, sensors, radio or battery are not set up."""
+"""Without effect. If they are missing, QGroundControl warns that frame, sensors, radio or battery are not set up."""

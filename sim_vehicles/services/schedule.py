@@ -1,4 +1,4 @@
-"""When a vehicle sends its reports: on whole milliseconds of its own boot clock.
+"""Schedule of a vehicle's reports, on whole milliseconds of its own boot clock.
 
 A state sampled on a whole millisecond needs no rounding in time_boot_ms. Periodic reports fall on multiples of the
 period since boot, rounded up to the next millisecond, so requesting the same rate again does not shift them.
@@ -18,13 +18,13 @@ ONCE = 0
 
 @kernel
 def period_ms(interval_us: int, number: int) -> int:
-    """Boot time in ms at which a period with this number ends."""
+    """Boot time in ms at which period `number` ends."""
     return -(-number * interval_us // US_PER_MS)
 
 
 @kernel
 def schedule_report(vehicle: Record, k: int, number: int) -> None:
-    """Send report k at the end of the period with this number, or never if it has no period."""
+    """Schedule report k for the end of period `number`, or for never if it has no period."""
     vehicle.due_ns[k] = NEVER_NS
     if vehicle.interval_us[k] != 0:
         vehicle.number[k] = number
@@ -43,7 +43,7 @@ _schedule_report_at = at_row(schedule_report)
 
 
 class Schedule:
-    """The next instants of a vehicle's periodic messages, and of those requested once."""
+    """Due times of a vehicle's periodic messages, and of messages requested once."""
 
     _report = Cell[int]()
     _report_ns = Cell[int]()
@@ -70,7 +70,7 @@ class Schedule:
         return self._interval_us.get(message_id, 0)
 
     def set_interval(self, message_id: int, interval_us: int, now_ns: int) -> None:
-        """Send a message periodically from the first instant after now; 0 stops it."""
+        """Send a message periodically, first at its first due time after now; 0 stops it."""
         self._interval_us[message_id] = interval_us
         self._from_ns[message_id] = now_ns
         number = self._clock.boot_ns(now_ns) // (interval_us * 1000) + 1 if interval_us else 0
@@ -86,7 +86,7 @@ class Schedule:
         self._note_next()
 
     def set_clock(self, clock: BootClock, now_ns: int) -> None:
-        """Continue with another clock: everything scheduled is kept, at instants of the new clock."""
+        """Continue with another clock: everything scheduled is kept, at times of the new clock."""
         singles = [entry for entry in self._queue if entry[3] == ONCE]
         self._queue = []
         self._use(clock)
@@ -96,7 +96,7 @@ class Schedule:
             self.add_once(message_id, due_ns)
 
     def add_once(self, message_id: int, now_ns: int) -> None:
-        """Send a message at the next whole millisecond, at once if now is one."""
+        """Send a message once, at the next whole millisecond of boot time; now, if now is one."""
         boot_ms = -(-self._clock.boot_ns(now_ns) // NS_PER_MS)
         entry = (max(now_ns, self._clock.host_ns(boot_ms * NS_PER_MS)), message_id, boot_ms, ONCE)
         if entry not in self._queue:  # two requests within a millisecond are answered once, so the queue stays short

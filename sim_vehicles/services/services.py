@@ -1,7 +1,7 @@
-"""What every kind of vehicle answers when a ground station asks for more than telemetry.
+"""Answers of every kind of vehicle to requests for more than telemetry.
 
-Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION. From then on the vehicle also sends, at
-low rates, the reports that they expect. Our own station does not greet, and is sent only what it requests.
+Most ground stations greet a vehicle by requesting AUTOPILOT_VERSION. From then on the vehicle also sends, at low rates,
+the reports that such stations expect. Our own station does not greet, and gets only what it requests.
 """
 
 import math
@@ -62,7 +62,7 @@ class Services:
         self.orphaned = False
         """Whether the station that started the simulation has gone, so that another one may end it."""
         self.shut_down_ns: int | None = None
-        """When a vehicle without its station was told to shut down."""
+        """When an orphaned vehicle was told to shut down; None if it was not."""
         self._experiment = experiment
         self._encoder = encoder
         self._schedule = schedule
@@ -92,14 +92,14 @@ class Services:
         return frames
 
     def next_parameter(self, time_ns: int) -> bytes:
-        """The next parameter of a list, at its scheduled instant."""
+        """The frame of the next parameter of a list, which is due now."""
         frame = self.parameters.next_of_list(self._encoder)
         if not self.parameters.listing:
             self._set(PARAMETER_VALUE, 0, time_ns)
         return frame
 
     def command(self, command: Command, time_ns: int) -> tuple[int, list[Message]]:
-        """The MAV_RESULT of a command about messages, and what is sent right after it; reports are scheduled."""
+        """Obey a command about messages. Returns its MAV_RESULT and what to send at once; reports are scheduled."""
         number, message_id, second = command.command, whole(command.param1), whole(command.param2)
         wants_message = number == mavlink.COMMAND_REQUEST
         if number == mavlink.COMMAND_INTERVAL:
@@ -145,7 +145,7 @@ class Services:
         return ACCEPTED
 
     def _greet(self, time_ns: int) -> tuple[int, list[Message]]:
-        """Send AUTOPILOT_VERSION, and start the reports that a station which asks for it expects."""
+        """Answer with AUTOPILOT_VERSION, and start the reports that a station asking for it expects."""
         for message_id, interval_us in GREETED_US.items():
             if not self._schedule.interval_us(message_id):
                 self._set(message_id, interval_us, time_ns)

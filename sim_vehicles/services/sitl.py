@@ -7,7 +7,7 @@ from sim_vehicles.services.draws import Use, draws_of
 
 
 def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
-    """By how much (ns) each TIMESYNC reply of a vehicle is backdated, without end; empty where replies are exact."""
+    """The times (ns) by which a vehicle's TIMESYNC replies are backdated, without end; none if replies are exact."""
     most_ns = round(scenario.autopilot.sitl.timesync_back_s * NS_PER_S)
     rng = draws_of(scenario.seed, system_id, Use.BACKDATING)
     while scenario.dynamics == "autopilot" and scenario.autopilot.sitl.timesync_back_s > 0.0:
@@ -15,7 +15,7 @@ def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
 
 
 def slips(scenario: Scenario, system_id: int, start_ns: int) -> Iterator[tuple[int, int]]:
-    """When a boot clock slips, and by how much: (host time in ns, change in ns), without end; empty without slips."""
+    """The slips of a boot clock, as (host time in ns, change in ns), without end; none if it never slips."""
     sitl, time_ns = scenario.autopilot.sitl, start_ns
     rng = draws_of(scenario.seed, system_id, Use.SLIPS)
     while sitl.slip_s:

@@ -1,6 +1,6 @@
 """A simulated multicopter that behaves like ArduCopter or PX4 as seen from outside.
 
-It boots, sends heartbeats, then telemetry, then gets a position. It can be armed, takes off to an altitude, follows
+It boots, sends heartbeats, then telemetry, then has a position. It can be armed, takes off to an altitude, follows
 velocity and acceleration set-points with a lag, and lands. The fleet flies it if the scenario has `dynamics =
 "autopilot"`.
 """
@@ -35,9 +35,9 @@ REPORTED = (
     mavlink.LOCAL_POSITION, mavlink.POSITION_TARGET,
     mavlink.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION,
 )  # fmt: skip
-"""With the estimator's, the messages that can be requested besides those of every vehicle."""
+"""Messages that can be requested besides the estimator's and those of every vehicle."""
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
-"""Estimator flags when all is well; and with attitude only, constant position mode, uninitialised."""
+"""Estimator flags when ready; and when not: attitude only, constant position mode, uninitialised."""
 _NO_POSITION = "Need Position Estimate"
 _NO_JUMP = NEVER_NS, 0, ""
 _ACCEPTED: Answer = mavlink.ACCEPTED, ""
@@ -94,7 +94,7 @@ class Copter:
 
     @property
     def deadline_ns(self) -> int:
-        """The next instant at which an event happens that is not a report."""
+        """Time of the next event that is not a report."""
         deadline_ns = min(self._jump[0], self._complains_ns)
         if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
             deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
@@ -103,7 +103,7 @@ class Copter:
         return deadline_ns
 
     def happen(self, time_ns: int) -> None:
-        """Run the event at the deadline: a jump, a complaint, a disarming on the ground, or set-points that stop."""
+        """Run the event at the deadline: a clock jump, a complaint, disarming on the ground, or lost set-points."""
         self.move(time_ns)
         if time_ns == self._jump[0]:
             _, by_ns, text = self._jump
@@ -228,7 +228,7 @@ class Copter:
         self.mode, self.failsafe, self._takeoff_m = mode, False, None
         self._target = self._stopped()
         if mode == self.rules.guided_mode == self.rules.takeoff_mode:
-            self._setpoint_ns = time_ns  # the time-out starts with the mode
+            self._setpoint_ns = time_ns  # the timeout starts with the mode
         self._radio.tell(time_ns, self.rules.modes[mode])
         return _ACCEPTED
 
@@ -252,7 +252,7 @@ class Copter:
     # What it sends
 
     def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
-        """The frame of one of its messages; None for a position that it does not have yet."""
+        """The frame of one of its messages; None if it has nothing to report, such as a position before it has one."""
         encoder, motion, ready = self._radio.encoder, self.motion, self._ready(time_ns)
         origin_north_m, origin_east_m, origin_up_m = self.origin_neu_m
         boot_ms &= mavlink.UINT32
@@ -289,10 +289,10 @@ class Copter:
         return self.mode == self.rules.guided_mode and not self.landed and self._takeoff_m is None
 
     def _active_target(self, boot_ms: int) -> messages.Message:
-        """What it steers to now: the velocity of the set-point, and its acceleration.
+        """Its target as it reports it: the velocity and the acceleration of the set-point.
 
-        With ArduCopter the velocity has grown since, and float32 has rounded the acceleration to cm and back.
-        PX4 reports the acceleration that its velocity loop wants.
+        In ArduCopter the velocity has since integrated the acceleration, which itself was rounded when converted to cm
+        and back in float32. PX4 reports the acceleration that its velocity loop wants.
         """
         target, (north, east) = self._target, self._target[0:2]
         if self.rules.velocity_grows:
@@ -304,7 +304,7 @@ class Copter:
         return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), (north, east))
 
     def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
-        """What it reports to other ground stations; its tilt follows from its acceleration."""
+        """Its state as reported to other ground stations; the tilt follows from the acceleration."""
         motion = self.motion
         cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
         north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
@@ -334,7 +334,7 @@ class Copter:
         self._radio.tell(time_ns, "takes off")
 
     def _flown(self, time_ns: int, *, foreseen: bool = False) -> tuple[Motion, Target]:
-        """Motion and target at a later instant."""
+        """Motion and target at a later time."""
         if self._air is None:
             return advance(self.motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
 

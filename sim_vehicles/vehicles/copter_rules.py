@@ -19,7 +19,7 @@ TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
 """The parameter with the altitude above ground, in m, of a take-off command without an altitude."""
 MOST_JERK_M_S3 = 20.0
-"""The jerk limit that a vehicle without one reports: the most that both autopilots allow."""
+"""Jerk limit that a vehicle without one reports: the largest that both autopilots allow."""
 GROUND_DISARM_S = 10.0
 """Both autopilots disarm if they have not taken off this long after arming."""
 
@@ -31,7 +31,7 @@ def px4_mode(main: int, sub: int = 0) -> int:
 
 @dataclass(frozen=True)
 class Rules:
-    """How one autopilot, ArduCopter or PX4, behaves and what it reports."""
+    """Behaviour and reports of one autopilot, ArduCopter or PX4."""
 
     autopilot: int
     """MAV_AUTOPILOT"""
@@ -58,7 +58,7 @@ class Rules:
     velocity_grows: bool
     """Whether the velocity target integrates the acceleration between two set-points."""
     complains_every_s: float
-    """How often it says by itself why it cannot be armed; 0 for never."""
+    """Interval at which it reports unasked why it cannot be armed; 0 for never."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2 (MAV_PROTO_VER 0)."""
 
@@ -132,9 +132,9 @@ def parameters(rules: Rules, system_id: int, settings: Autopilot) -> Parameters:
 
 
 def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
-    """What a set-point asks for: (why it is not flown or "", velocity counts, acceleration counts).
+    """Interpret a set-point: (reason not to fly it or "", velocity counts, acceleration counts).
 
-    One ignored axis drops all three of its vector. A refused set-point makes ArduCopter stop; PX4 ignores it.
+    One ignored axis makes its whole vector ignored. A refused set-point makes ArduCopter stop; PX4 ignores it.
     """
     mask = setpoint.type_mask
     velocity, acceleration = not mask & setpoints.VELOCITY_AXES, not mask & setpoints.ACCELERATION_AXES
@@ -150,7 +150,7 @@ def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]
 def setpoint_target(
     setpoint: Setpoint, rules: Rules, *, yaw_rad: float, velocity_gain_1_s: float
 ) -> tuple[str, Target]:
-    """Why a set-point is not flown, or "", and the target that it sets for a vehicle with this yaw.
+    """The reason not to fly a set-point, or "", and the target that it sets for a vehicle with this yaw.
 
     Ignored fields may hold anything, even NaN, which some clients send.
     """

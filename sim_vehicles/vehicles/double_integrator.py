@@ -1,7 +1,7 @@
 """The double integrator: a UAV that follows the commanded acceleration at once, with the modes of ArduCopter.
 
-It starts on a launcher, where it reports its initial position and velocity without moving. It flies from the instant at
-which, armed and in GUIDED, it accepts a take-off command or its first set-point.
+It starts on a launcher, where it reports its initial position and velocity without moving. Its flight begins when,
+armed and in GUIDED, it accepts a take-off command or its first set-point.
 """
 
 import math
@@ -112,7 +112,7 @@ class DoubleIntegrator:
 
     @property
     def deadline_ns(self) -> int:
-        """When the first held set-point acts, or the failsafe begins unless a station is heard before."""
+        """When the first held set-point acts, or the failsafe begins unless the station is heard first."""
         if self._hold is not None and self._hold.next_ns <= self.flight.deadline_ns:
             return self._hold.next_ns  # a set-point on the deadline is in time
         return self.flight.deadline_ns
@@ -127,14 +127,14 @@ class DoubleIntegrator:
         return self._moved(own, self._air, time_ns, foreseen=True)
 
     def acts_at(self, time_ns: int) -> int:
-        """The instant at which a message that arrives now acts: never before one that has already acted."""
+        """The time at which a message that arrives now acts: never before one that has already acted."""
         return max(time_ns, self._state_ns)
 
     def hear_heartbeat(self, time_ns: int) -> None:
         self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
-        """Fly a valid and allowed set-point from now on or, if set-points are held, from when it is to act."""
+        """Fly a valid and allowed set-point from now on or, if set-points are held, from its due time on."""
         if self._hold is None:
             return self._fly(setpoint, time_ns)
         if self._hold.take(setpoint, time_ns, self._radio.clock):
@@ -173,7 +173,7 @@ class DoubleIntegrator:
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
-        """Read the time-outs and the loop's gains from the parameters."""
+        """Read the timeouts and the loop's gains from the parameters."""
         timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
         self.flight.set_timeouts(*timeouts_s, time_ns)
         if self._onboard is not None:
@@ -282,7 +282,7 @@ class DoubleIntegrator:
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
-            down_m_s = 0.0 - climb_m_s  # not -0.0, whose bytes are sent
+            down_m_s = 0.0 - climb_m_s  # not -0.0, whose sign bit would be sent
             return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
         if message_id in (mavlink.POSITION_TARGET, messages.NAMED_INT):
             return self._active_target(boot_ms) if message_id == mavlink.POSITION_TARGET else self._lag(boot_ms)
@@ -298,7 +298,7 @@ class DoubleIntegrator:
         return self._radio.encoder.pack(messages.named_int(boot_ms, "LAG_MS", lag_ms))
 
     def _active_target(self, boot_ms: int) -> bytes | None:
-        """The acceleration that it follows within its limits, while it takes set-points."""
+        """The acceleration that it follows within its limits; None unless it takes set-points."""
         flight = self.flight
         if not flight.flying or flight.mode != mavlink.MODE_GUIDED or flight.failsafe:
             return None
@@ -318,7 +318,7 @@ class DoubleIntegrator:
         return Attitude(0.0, 0.0, roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau))
 
     def _condition(self, boot_ms: int) -> messages.Condition:
-        """What it reports to other ground stations."""
+        """Its state as reported to other ground stations."""
         state, attitude = self._state, self._attitude()
         return messages.Condition(
             boot_ms,
@@ -362,4 +362,4 @@ class DoubleIntegrator:
         counters["model_faults"] += 1
         if counters["model_faults"] == 1:
             self._radio.tell(self._state_ns, f"fault in its dynamics: {text}")
-            self._radio.say(self._state_ns, f"dynamics: {text}"[:50])  # the characters of one chunk
+            self._radio.say(self._state_ns, f"dynamics: {text}"[:50])  # at most the characters of one chunk

@@ -21,7 +21,7 @@ from sim_vehicles.vehicles.shell import Answer
 STEP_NS = 20_000_000
 """Time between two corrections of the pilot."""
 _UP_FRACTION = 0.95
-"""At this fraction of its altitude a take-off is over."""
+"""A take-off is over at this fraction of its altitude."""
 _ABOUT_FLYING = (
     mavlink.COMMAND_ARM,
     mavlink.COMMAND_MODE,
@@ -33,7 +33,7 @@ _PILOT = (0, 0)
 
 
 class ExternallyFlown:
-    """The craft in the shell, with the craft that its pilot flies."""
+    """The craft in the shell: it wraps the craft that its pilot flies."""
 
     def __init__(self, scenario: schema.Scenario, craft: DoubleIntegrator | Copter, altitude_m: float) -> None:
         self.craft = craft
@@ -80,7 +80,7 @@ class ExternallyFlown:
         copter.command(_command(mavlink.COMMAND_TAKEOFF, altitude_m=self._altitude_m + above_m), time_ns)
 
     def _steer(self, time_ns: int) -> None:
-        """Command the course's velocity and acceleration in the middle of the step."""
+        """Command the course's velocity and acceleration at the middle of the step."""
         craft, middle_s = self.craft, (time_ns - self.begin_ns + STEP_NS // 2) / NS_PER_S
         velocity, acceleration = self._scenario.nominal_velocity_at(middle_s), (0.0, 0.0)
         if self._scenario.course.is_smooth:

@@ -19,7 +19,7 @@ MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "
 
 
 _STOPPED = ("", "set-points", "station heartbeat")
-"""Which stream stopped, by its number in the record; the first outside the failsafe."""
+"""Name of the stream that stopped, by its number in the record; the first is for outside the failsafe."""
 
 
 @kernel
@@ -30,7 +30,7 @@ def takes_setpoints(vehicle: Record) -> bool:
 
 @kernel
 def note_setpoint(vehicle: Record, now_ns: int) -> None:
-    """Restart the time-out of set-points."""
+    """Restart the timeout of set-points."""
     if now_ns > vehicle.setpoint_ns or vehicle.setpoint_ns == NEVER_NS:
         vehicle.setpoint_ns = now_ns
     set_deadline(vehicle)
@@ -38,7 +38,7 @@ def note_setpoint(vehicle: Record, now_ns: int) -> None:
 
 @kernel
 def note_heartbeat(vehicle: Record, now_ns: int) -> None:
-    """Restart the time-out of the station's heartbeats."""
+    """Restart the timeout of the station's heartbeats."""
     vehicle.heartbeat_ns = max(vehicle.heartbeat_ns, now_ns)
     set_deadline(vehicle)
 
@@ -58,13 +58,13 @@ _set_deadline_at = at_row(set_deadline)
 
 
 class FlightMode:
-    """The mode of one vehicle. Every method takes the instant at which its event happens."""
+    """The mode of one vehicle. Every method takes the time at which its event happens."""
 
     armed = Cell[bool]()
     mode = Cell[int]()
     flying = Cell[bool]()
     deadline_ns = Cell[int]()
-    """When the failsafe begins unless a station is heard before."""
+    """When the failsafe begins unless the station is heard first."""
     _stopped = Cell[int]()
     _setpoint_ns = Cell[int]()
     _setpoint_timeout_ns = Cell[int]()
@@ -108,7 +108,7 @@ class FlightMode:
         return ""
 
     def take_off(self, now_ns: int) -> int:
-        """Begin the flight on command; returns the MAV_RESULT. The set-point time-out begins with the first."""
+        """Begin the flight on command; returns the MAV_RESULT. The first set-point starts the set-point timeout."""
         if self.flying or not self.armed or self.mode != MODE_GUIDED:
             return DENIED
         self.flying = True

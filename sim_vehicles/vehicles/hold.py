@@ -1,8 +1,8 @@
-"""Holds set-points until a fixed time after their stamps, so that jitter becomes constant delay: a playout buffer.
+"""A playout buffer: holds set-points until a fixed time after their stamps, which turns jitter into constant delay.
 
-The stamp, time_boot_ms, is in the station's clock, the arrival in the vehicle's; their unknown offset is constant. The
-*lag* is the 99th percentile of the last differences arrival - stamp, offset included. A set-point acts when the
-vehicle's clock shows its stamp plus the lag. One that arrives later acts at once.
+The stamp, time_boot_ms, is in the station's clock and the arrival in the vehicle's; the offset between the two is
+unknown but constant. The *lag* is the 99th percentile of the last differences arrival - stamp, offset included. A
+set-point acts when the vehicle's clock shows its stamp plus the lag. One that arrives later acts at once.
 """
 
 import heapq
@@ -15,14 +15,14 @@ from sim_vehicles.services.clock import NEVER_NS, NS_PER_MS, BootClock
 from sim_vehicles.services.mavlink import Setpoint
 
 _ARRIVALS = 500
-"""Set-points of which the lag is a percentile: 10 s at 50 Hz."""
+"""Number of set-points whose 99th percentile is the lag: 10 s at 50 Hz."""
 _LONGEST_MS = 5000
-"""If the lag exceeds a new difference by more than this, the older stamps were of another station, or of a clock that
-has been set since: they are forgotten."""
+"""If the lag exceeds a new difference by more than this, the older stamps came from another station, or from a clock
+that has been set since, and are forgotten."""
 
 
 class Hold:
-    """The set-points that have arrived and do not act yet. `next_ns` is when the first of them does."""
+    """Set-points that have arrived but do not act yet. `next_ns` is when the first of them acts."""
 
     def __init__(self) -> None:
         self.next_ns = NEVER_NS
@@ -31,7 +31,7 @@ class Hold:
         self._arrivals: deque[int] = deque()
         self._ordered: list[int] = []
         self._queue: list[tuple[int, int, Setpoint]] = []
-        """(instant, number, set-point), earliest first."""
+        """(due time in ns, number, set-point), earliest first."""
         self._taken = self._newest_ms = self._newest_ns = 0
 
     def take(self, setpoint: Setpoint, time_ns: int, clock: BootClock) -> bool:

@@ -4,8 +4,8 @@
 
 Each step computes the first two terms and holds them. The spacing comes from a sensor that measures the vehicle ahead
 every few steps; between measurements it is extrapolated with the measured relative velocity. The set-points bring what
-the vehicle cannot know by itself: v_d as their velocity and w as their acceleration. w acts when it arrives, v_d from
-the next step.
+the vehicle cannot know by itself: v_d in their velocity field and w in their acceleration field. w acts when it
+arrives, v_d from the next step.
 
 When set-points stop, w is dropped and the other terms stay in force: what the station computed from other vehicles is
 stale, but the measured spacing is not, and a vehicle that only coasted would drift among others that keep their places.
@@ -22,13 +22,13 @@ from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.parameters import Parameter, Parameters
 
 STEP = -1
-"""A step of this loop, as an entry of the vehicle's schedule beside the message ids."""
+"""Stands for a step of this loop among the message ids of the vehicle's schedule."""
 LARGEST_GAIN, LARGEST_OFFSET_M = 1e4, 1e6
 _AXES = "NE"
 _NAMES_P, _NAMES_V = ([f"FORM_{kind}_{i}{j}" for i in _AXES for j in _AXES] for kind in ("KP", "KV"))
 
 Look = tuple[float, float, float, float]
-"""What the sensor measures: position and velocity of another vehicle relative to this one, north and east."""
+"""A measurement of the sensor: position and velocity of another vehicle relative to this one, north and east."""
 
 
 def formation_parameters() -> list[Parameter]:
@@ -40,7 +40,7 @@ def formation_parameters() -> list[Parameter]:
 
 
 class VehicleLoop:
-    """The loop of one vehicle. `state_of` gives the true state of another vehicle at an instant, for the sensor."""
+    """The loop of one vehicle. `state_of` gives the true state of another vehicle at a time, for the sensor."""
 
     def __init__(self, scenario: schema.Scenario, system_id: int, state_of: Callable[[int, int], State | None]) -> None:
         own = scenario.onboard

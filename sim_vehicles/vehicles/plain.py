@@ -1,8 +1,8 @@
-"""The usual events of plain vehicles in one kernel: set-points, heartbeats and TIMESYNC of the station, and reports.
+"""Runs the usual events of plain vehicles in kernels: the station's set-points, heartbeats and TIMESYNC, and reports.
 
 A plain craft is a double integrator whose set-points act at once, and which reports its true state (`Craft.is_plain`).
-If its links are plain, too (`Link.plain`), the kernel runs its events in order of time, as `Shell` does, and stops
-before one that is not usual.
+If its links are plain, too (`Link.plain`), a kernel runs its events in order of time, as `Shell` does, and stops before
+an unusual one.
 """
 
 from math import copysign, cos, pi, sin, tau
@@ -45,15 +45,15 @@ from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, tak
 from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
 
 UNUSUAL, MOVE_FIRST, SILENT = -2, -1, 0
-"""In place of the size of a frame to send: nothing has happened, as the event is unusual or the craft must move first;
-or it has happened, and there is no frame."""
+"""Returned in place of a frame's size. UNUSUAL, MOVE_FIRST: nothing was done, as the event is unusual or the craft must
+move first. SILENT: done, with no frame to send."""
 _SETPOINT_BYTES, _HEARTBEAT_BYTES = 53, 9
-"""Whole payloads: those of usual set-points and heartbeats do not end in zeros."""
+"""Sizes of complete payloads: usual set-points and heartbeats do not end in zeros."""
 
 
 @kernel
 def _must_move(vehicle: Record, time_ns: int) -> bool:
-    """Whether the craft must move to a time before an event there: kernels do not know what pushes it."""
+    """Whether the craft must move to the time of an event first: kernels do not know what pushes it."""
     return vehicle.pushed and vehicle.flying and time_ns > vehicle.state_ns
 
 
@@ -125,7 +125,7 @@ def _take_timesync(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -
 
 @kernel
 def report(vehicle: Record, frame: Frame, truth: Records) -> int:
-    """Make the report that is due, before any other event, and schedule the next; returns as `hear`."""
+    """Make the next report, before any other event, and schedule the one after it; returns as `hear`."""
     k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
     if REPORTS[k] == LOCAL_POSITION or REPORTS[k] == GLOBAL_POSITION:
         if _must_move(vehicle, time_ns):
@@ -156,7 +156,7 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
 
 @kernel
 def _within_half_a_turn(angle: float) -> float:
-    """`math.remainder(angle, tau)`, which Numba does not know, to the bit but for the sign of exactly half a turn."""
+    """`math.remainder(angle, tau)`, which Numba lacks, to the same bits except the sign of exactly half a turn."""
     over = abs(angle) % tau
     return copysign(1.0, angle) * (over if over <= tau - over else over - tau)
 
@@ -211,7 +211,7 @@ def run(
 
 @kernel
 def leaves_ns(vehicle: Record, up: Record, down: Record) -> int:
-    """The earliest instant at which a datagram of the vehicle can leave its up link."""
+    """The earliest time at which a datagram of the vehicle can leave its up link."""
     acts_ns = min(vehicle.acts_ns, down.next_due_ns)
     if acts_ns <= NEVER_NS - up.least_delay_ns:
         acts_ns += up.least_delay_ns
@@ -223,9 +223,9 @@ def _enter_all(
     links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     data: Bytes, received: Ints, first: int,
 ) -> int:  # fmt: skip
-    """Let datagrams enter their down links, from the first one on; returns the first that cannot, or their number.
+    """Let datagrams from `first` on enter their down links; returns the first that cannot, or their number.
 
-    The rows of `received` say of each where it begins and ends in `data`, the vehicle's row, and its time.
+    The rows of `received` are start and end of each datagram in `data`, the vehicle's row, and the time.
     """
     for k in range(first, received.shape[1]):
         begin, size, row = received[0, k], received[1, k] - received[0, k], row_of(received[2, k], LINK_DOWN)
@@ -252,9 +252,9 @@ def _run_all(
     vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     waiting: Ints, now_ns: int,
 ) -> int:  # fmt: skip
-    """Run the plain vehicles of which a datagram can leave by now until now.
+    """Run until now each plain vehicle that may have a datagram leave by now, up to an unusual event.
 
-    Returns how many others wait; these are in `waiting`, as (when their next datagram can leave, row).
+    Returns how many vehicles are left to Python; `waiting` holds (when their next datagram can leave, row) of each.
     """
     count = 0
     for row in range(len(vehicles)):
@@ -275,9 +275,9 @@ def leave_all(
 ) -> int:  # fmt: skip
     """Take datagrams that leave their up links by now; returns how many.
 
-    More than `leaving` has columns or `truth` has rows for are left to the next call.
+    Those for which `leaving` has no column or `truth` no row are left to the next call.
 
-    The rows of `leaving` say of each where it begins and ends in `data`, the vehicle's row, and its time.
+    The rows of `leaving` are start and end of each datagram in `data`, the vehicle's row, and the time.
     """
     count = end = 0
     for row in range(len(vehicles)):
@@ -297,7 +297,7 @@ def leave_all(
 
 @kernel
 def next_leaving_ns(vehicles: Records, links: Records) -> int:
-    """The earliest instant at which a datagram of any vehicle can leave."""
+    """The earliest time at which a datagram of any vehicle can leave."""
     first_ns = NEVER_NS
     for row in range(len(vehicles)):
         up, down = links[row_of(row, LINK_UP)], links[row_of(row, LINK_DOWN)]
@@ -310,7 +310,7 @@ def step_all(
     vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     data: Bytes, received: Ints, waiting: Ints, leaving: Ints, leaving_data: Bytes, first: int, now_ns: int,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Let datagrams enter, from the first one on, run the vehicles until now, and take what leaves by then.
+    """Let datagrams from `first` on enter, run the vehicles until now, and take what leaves by now.
 
     Returns the results of `_enter_all`, `_run_all` and `leave_all`. If not all could enter, nothing else is done yet;
     if vehicles wait, nothing leaves yet.

@@ -1,4 +1,4 @@
-"""How a set-point is read: which of its vectors count, and in which frame."""
+"""Interpretation of a set-point: which of its vectors count, and in which frame."""
 
 import math
 
@@ -11,7 +11,7 @@ VELOCITY, ACCELERATION, VELOCITY_ACCELERATION = AXES & ~VELOCITY_AXES, AXES & ~A
 """The bits of AXES that are set (ignored) when only velocity, only acceleration, or both count."""
 FORCE_SET, YAW_IGNORED, YAW_RATE_IGNORED = 0x200, 0x400, 0x800
 LOCAL_FRAMES, BODY_FRAMES = (1, 7), (8, 9)
-"""LOCAL_NED and LOCAL_OFFSET_NED, BODY_NED and BODY_OFFSET_NED: equal for velocities and accelerations."""
+"""LOCAL_NED and LOCAL_OFFSET_NED, BODY_NED and BODY_OFFSET_NED: a pair is equal for velocities and accelerations."""
 ABSURD = 1e4
 """A set-point with more m/s² or m/s than this is refused."""
 

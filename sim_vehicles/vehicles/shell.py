@@ -2,7 +2,7 @@
 
 The shell reads datagrams, obeys one station, answers TIMESYNC, commands and requests, and reports on a schedule. The
 `Craft` in it knows how the vehicle moves and which set-points and modes it accepts. Everything happens at its exact
-instant, however late `step` is called.
+time, however late `step` is called.
 """
 
 from collections import Counter, deque
@@ -31,7 +31,7 @@ from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, UNUSUAL, hear_at, re
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
 LONGEST_HISTORY = 1000
-"""Most unread changes that are kept: a hostile sender can cause any number of them."""
+"""Maximum number of unread changes kept: a hostile sender can cause any number of them."""
 
 Answer = tuple[int, str]
 """The MAV_RESULT of a command, and the STATUSTEXT sent with it, "" for none."""
@@ -46,11 +46,11 @@ class Change(NamedTuple):
 
 
 class Radio:
-    """What the shell and the craft share: the clock, the counters, the frames sent, and the changes.
+    """State shared by the shell and the craft: the clock, the counters, the frames sent, and the changes.
 
     `counters` counts received messages: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`,
     and by reason those not obeyed: `refused_...` are invalid, `ignored_...` are valid but not for this vehicle, or not
-    now. Those that kernels count are in the vehicle's record until `take_counts` adds them.
+    now. Counts made by kernels stay in the vehicle's record until `take_counts` adds them.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Radio:
         self.recorder = recorder
         self.truth_rows = rows_of(recorder)
         self.out: list[tuple[bytes, int]] = []
-        """Frames sent in this step, with their instants."""
+        """Frames sent in this step, with their times."""
 
     def take_counts(self) -> Counter[str]:
         """The counters, with what kernels have counted."""
@@ -113,7 +113,7 @@ class Radio:
 
 
 class Craft(Protocol):
-    """What flies. Calls are in order of time; `acts_at` says when a message that arrives late acts."""
+    """The craft in a shell. Calls are in order of time; `acts_at` says when a message that arrives late acts."""
 
     parameters: Parameters
     version: tuple[int, int, int]
@@ -126,7 +126,7 @@ class Craft(Protocol):
     intervals_us: Mapping[int, int]
     """The messages it can report besides heartbeats, each with its default interval, 0 for none."""
     reports_from_ns: int
-    """Before this instant it sends heartbeats only."""
+    """Before this time it sends heartbeats only."""
 
     @property
     def deadline_ns(self) -> int: ...  # of the next event that is not a report
@@ -188,9 +188,9 @@ class Shell(Generic[Flown]):
         return deadline_ns if deadline_ns < scheduled_ns else scheduled_ns
 
     def step(self, datagrams: Iterable[tuple[bytes, int]], now_ns: int) -> list[tuple[bytes, int]]:
-        """Run until now; takes the datagrams that arrive and returns those sent, with instants, in order of time.
+        """Run until now; takes the datagrams that arrive and returns those sent, with times, in order of time.
 
-        A datagram whose instant has passed acts at once. One that arrives at the instant of a scheduled event comes
+        A datagram whose time has passed acts at once. One that arrives at the time of a scheduled event is handled
         first: a set-point on the deadline is in time.
         """
         self.radio.out = out = []
@@ -201,7 +201,7 @@ class Shell(Generic[Flown]):
         return out
 
     def _run(self, end_ns: int) -> None:
-        """Run everything due before the end; at one instant the deadline first, so that reports show its effect."""
+        """Run everything due before `end_ns`; at equal times the deadline first, so that reports show its effect."""
         schedule, craft = self._schedule, self.craft
         while True:
             deadline_ns, scheduled_ns = craft.deadline_ns, schedule.next_ns
@@ -234,7 +234,7 @@ class Shell(Generic[Flown]):
         radio.send(frame, time_ns)
 
     def _reports_plainly(self, time_ns: int) -> bool:
-        """Send the report that is due, if a kernel can."""
+        """Send the due report from a kernel, if possible; returns whether it was sent."""
         radio, (vehicles, _, row) = self.radio, self.radio.place
         size = report_at(vehicles, row, self._frames, radio.truth_rows) if self.craft.is_plain else UNUSUAL
         if size == MOVE_FIRST:
@@ -246,7 +246,7 @@ class Shell(Generic[Flown]):
         return True
 
     def _hears_plainly(self, data: bytes, time_ns: int) -> bool:
-        """Act on a datagram, if a kernel can."""
+        """Act on a datagram in a kernel, if possible; returns whether it did."""
         if not self.craft.is_plain or len(data) > FRAME_BYTES:
             return False
         radio, (vehicles, _, row) = self.radio, self.radio.place
