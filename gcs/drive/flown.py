@@ -92,7 +92,7 @@ def identified_in_flight(plan: FlightPlan) -> FlightPlan:
 
 
 def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flight:
-    """Fly a plan in real time. The run is kept if a folder, created if missing, is given; otherwise it is deleted."""
+    """Fly a plan in real time and leave the run in a folder, created if missing; without a folder it is deleted."""
     from gcs.drive.fly import fly  # processes and sockets, which flights in virtual time do not need
     from gcs.drive.udp import StationSocket
 

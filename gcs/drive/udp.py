@@ -31,7 +31,7 @@ from scenarios.sockets import Bytes, Ints, Reader, address_of, number_of, realti
 _MOST_ADDRESSES = 8192
 """Most addresses remembered; a limit is needed because anybody may send."""
 _NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
-"""First bit of the network in an address's key, and the mask of the bits below, which are `number_of` the address."""
+"""First bit of the network in an address's key, and the mask of the bits below, which hold its `number_of`."""
 _TOGETHER_NS = 8_000_000
 """Least time between two wake-ups for datagrams. Reading late costs nothing, because stamps say when datagrams arrived
 and decisions fall only at ticks. Answers cannot wait longer: PX4 ignores one that arrives over 10 ms after its TIMESYNC

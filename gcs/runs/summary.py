@@ -227,7 +227,7 @@ def _error(rows: TickArray, column: str) -> Errors:
 
 
 def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Mapping[int, TickArray]) -> float | None:
-    """The settling time: when the last follower's error stayed within a fraction of its spacing; None if one did not.
+    """The time from which every follower's error stays within a fraction of its spacing; None if one does not.
 
     It must stay there for the last `_SETTLED_SHARE` of the flight: errors that oscillate or grow come near zero, too.
     A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
@@ -253,7 +253,7 @@ def _vehicle(
 ) -> VehicleSummary:
     """The figures of a vehicle, from all its `rows` and from those of the flight, `own`.
 
-    Only if the flight was not `completed`, the rows after it count for the final mode.
+    Rows after the flight count for the final mode only if the flight was not `completed`.
     """
     sent = chosen(own, own["commanded"])
     error_m = error[1] if error is not None and error[1].size else None
@@ -357,7 +357,7 @@ def _flown_spread(
 
 
 def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> FloatArray:
-    """(2, n, n): weight w of the last but one report in k's position and velocity when i's newest state was sampled.
+    """(2, n, n): weight w of the report before the newest in k's position and velocity at i's newest state.
 
     See `history.state_at`. w varies as clocks drift; its mean here keeps the variance w^2 + (1 - w)^2 of white noise.
     """

@@ -44,7 +44,7 @@ def ms_text(seconds: float | None, form: str = ".1f", *, unit: str = " ms") -> s
 
 
 def growth_text(factor: float | None) -> str:
-    """How errors grow by at most `factor`, None without bound, in words; 1 + 1e-6 counts as 1, as rounding adds 1e-10.
+    """In words, the growth of errors: by at most `factor`, or unbounded (None). Up to 1 + 1e-6 counts as rounding.
 
     >>> growth_text(1.0), growth_text(1.004), growth_text(1.15), growth_text(None)
     ('do not grow', 'grow at most 1.004 times', 'grow at most 1.15 times', 'grow without bound')
