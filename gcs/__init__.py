@@ -1,13 +1,13 @@
 """The ground station: flies formations over MAVLink and compares measured loop delay with the delay margin.
 
-From Python, `load_scenario` reads a scenario, `with_gain` gives it gains of one's own, and `fly_virtual` flies it in
-virtual time. `front` searches what can be had at loop delays; `plot_front`, `plot_growth` and `plot_root_locus` draw.
-`LawFormation` is what a control law of one's own is called with. Importing a name loads what it needs.
+From Python, `load_scenario` reads a scenario, `with_gain` gives it your own gains, and `fly_virtual` flies it in
+virtual time. `front` searches the best figures reachable at each loop delay; `plot_front`, `plot_growth` and
+`plot_root_locus` draw. Your own control law is called with a `LawFormation`. Each name is imported on first use.
 """
 
 import os
 
-# Before numpy is loaded: the matrices are small, and several BLAS threads on shared cores made them ten times slower.
+# Set before numpy is loaded: the matrices are small, and BLAS threads on shared cores made the work 10 times slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 TYPE_CHECKING = False

@@ -1,4 +1,4 @@
-"""The start of `gcs`: from here on the signals that end a command do so in one line, even while it still imports."""
+"""The entry point of `gcs`. Its signal handlers end a command with one line of output, even during the imports."""
 
 import contextlib
 import os
@@ -19,7 +19,7 @@ def main() -> None:
 
 
 def _end_at_once(*_: object) -> None:
-    with contextlib.suppress(OSError):  # the terminal may have gone
+    with contextlib.suppress(OSError):  # the terminal may be closed
         os.write(2, b"interrupted\n")
     os._exit(INTERRUPTED)
 

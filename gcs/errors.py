@@ -1,4 +1,4 @@
-"""The error that a user is shown as one line, and that line for a package that only an extra installs."""
+"""The error that is shown to users as one line, and the text of that line where an optional package is missing."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -12,16 +12,16 @@ _EXTRAS = {
     "mcap": "mcap",
     "distributed": "cluster",
 }
-"""The extra of this package that installs each module."""
+"""For each optional module, the extra of this package that installs it."""
 
 
 class InputError(Exception):
-    """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
+    """Unusable user input. Its message is one line that says what was read and what was wanted; the exit code is 2."""
 
 
 @contextmanager
 def usable(what: object, wanted: str) -> Generator[None]:
-    """While entered, an OSError is an InputError about what the user named."""
+    """Context manager that turns an OSError into an InputError about `what`, which the user named."""
     try:
         yield
     except OSError as error:
@@ -29,7 +29,7 @@ def usable(what: object, wanted: str) -> Generator[None]:
 
 
 def beyond(value: float, limit: float, decimals: int = 0) -> str:
-    """A value with as many decimals as show on which side of a limit it is.
+    """A value as text, with enough decimals (at least `decimals`) to show on which side of a limit it lies.
 
     >>> beyond(334.2, 30.0), beyond(10.02, 10.0), beyond(49.96, 50.0, 1)
     ('334', '10.02', '49.96')
@@ -41,7 +41,7 @@ def beyond(value: float, limit: float, decimals: int = 0) -> str:
 
 
 def extra_wanted(module: str | None) -> str:
-    """The line about a missing module that an extra of this package installs; empty for any other module."""
+    """The message for a missing module that an extra of this package installs; empty for any other module."""
     package = (module or "").partition(".")[0]
     if package not in _EXTRAS:
         return ""

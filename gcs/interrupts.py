@@ -1,7 +1,7 @@
 """How a command ends early: by Ctrl-C, SIGTERM, or the SIGHUP of a closed terminal or a dropped SSH session.
 
-At first all three end the process at once (`gcs.__main__`). Where something must be closed on the way out they raise
-KeyboardInterrupt (`raised`); in flight they become a reason to end it (`stop_signals`).
+By default all three end the process at once (`gcs.__main__`). Where resources must be closed first, they raise
+KeyboardInterrupt (`raised`). In flight they become the reason to end the flight (`stop_signals`).
 """
 
 import signal
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from typing import Any
 
 FROM_TERMINAL = frozenset((signal.SIGINT, signal.SIGHUP))
-"""A terminal sends these to every process of a command."""
+"""The signals that a terminal sends to every process of a command."""
 
 
 def ending_signals() -> list[signal.Signals]:
-    """The signals that end a command. Under nohup, SIGHUP is ignored and stays so."""
+    """The signals that end a command. SIGHUP is left out if it is ignored, as under nohup, and stays ignored."""
     ending = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
     return [number for number in ending if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN]
 
@@ -31,14 +31,14 @@ def _handled(handler: Callable[[int, Any], Any]) -> Generator[None]:
 
 @contextmanager
 def raised() -> Generator[None]:
-    """While entered, the signals raise KeyboardInterrupt, so that whatever is open is closed on the way out."""
+    """While entered, the signals raise KeyboardInterrupt, so open contexts are closed before the process ends."""
     with _handled(signal.default_int_handler):
         yield
 
 
 @contextmanager
 def stop_signals() -> Generator[Callable[[], str]]:
-    """While entered, the signals raise nothing: they become a reason to end the flight, and the vehicles hold."""
+    """While entered, the signals do not raise; the yielded function returns the first as a reason to stop, or ""."""
     asked: list[str] = []
 
     def on_signal(number: int, _: object) -> None:
@@ -50,7 +50,7 @@ def stop_signals() -> Generator[Callable[[], str]]:
 
 @contextmanager
 def held_back() -> Generator[None]:
-    """While entered, signals from a terminal wait; processes started meanwhile block them until they unblock them."""
+    """While entered, terminal signals are blocked and stay pending; processes started meanwhile inherit the mask."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, FROM_TERMINAL)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Standard output that may go away: its reader has enough, as `head`, the terminal closes, or the disk is full."""
+"""Standard output that survives losing its reader: a `head` that has exited, a closed terminal, a full disk."""
 
 import errno
 import io
@@ -10,22 +10,22 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of an OSError after which nothing more can be written."""
+"""The `errno` values after which nothing more can be written."""
 _GONE = (*DISK_FULL, errno.EPIPE, errno.EIO, errno.EBADF)
 _STANDARD = (0, 1, 2)
 
 
 def open_what_is_closed() -> None:
-    """Open /dev/null for closed standard files: otherwise a socket may get such a number, and be printed to."""
+    """Open /dev/null for closed standard files; otherwise a socket may get descriptor 1 or 2 and be printed to."""
     for number in _STANDARD:
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the least free number, which is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # open() takes the lowest free number: this one
 
 
 def outlive_readers() -> None:
-    """From now on no print raises: once nobody reads the output, it is dropped."""
+    """Make printing safe for the rest of the process: output that nobody can read any more is dropped, not an error."""
     if sys.stdout is sys.__stdout__:
         sys.stdout = _unfailing(1, sys.stdout)
     if sys.stderr is sys.__stderr__:
@@ -33,7 +33,7 @@ def outlive_readers() -> None:
 
 
 class _Unfailing(io.FileIO):
-    """A standard file that turns into the null device when it cannot be written."""
+    """A standard file that redirects itself to the null device once it cannot be written."""
 
     def write(self, data: "ReadableBuffer", /) -> int:
         try:

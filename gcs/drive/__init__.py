@@ -1,5 +1,5 @@
-"""What runs a station: `udp` in real time, `lockstep` in virtual time. The station's only sockets and clocks.
+"""The drivers that run a station: `udp` in real time, `lockstep` in virtual time, with its only sockets and clocks.
 
-`fly` is the whole of `gcs fly` after the options, `flown` flies a plan and returns its log. `preflight` refuses what
-cannot fly, `check` says what would be flown.
+`fly` does everything that `gcs fly` does after parsing options; `flown` flies a plan and returns its log. `preflight`
+refuses scenarios that cannot fly; `check` reports what would be flown.
 """

@@ -1,4 +1,4 @@
-"""A scenario before its flight: places, errors and commands at the start, and the expected loop delay."""
+"""Reports on a scenario before its flight: places, errors and commands at the start, and the expected loop delay."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -36,23 +36,23 @@ class VehicleCheck(Published):
     system_id: int
     follows: int | None
     place_ne_m: tuple[float, float]
-    """Wanted position relative to the leader."""
+    """Its place in the formation, relative to the leader."""
     spacing_error_m: float | None
     """None for the leader."""
     command_m_s2: float
     """Magnitude of the first command, before any limit."""
     command_max_m_s2: float | None
-    """The acceleration that the vehicle can fly at its initial speed; None without a limit."""
+    """The largest acceleration that its limits allow at its initial speed; None without a limit."""
     expected_loop_delay_s: float
     headroom: float | None
-    """As that of the formation, at this vehicle's expected loop delay."""
+    """Defined as for the formation, at this vehicle's own expected loop delay."""
     link_delay_left_s: float | None
-    """How much more delay its link takes, with all other links as they are. None if any, if it is not known, or if the
-    station predicts over the measured delay, which follows."""
+    """How much more delay its link tolerates while all other links stay as they are. None if there is no limit, if it
+    is unknown, or if the station predicts over the measured delay, which adapts to the link."""
 
 
 class PlannedMotionCheck(Published):
-    """The extremes of the motion that the course and formation changes ask of one vehicle, without any error."""
+    """Extremes of the motion that the course and formation changes require of one vehicle that flies without error."""
 
     system_id: int
     speed_min_m_s: float
@@ -64,12 +64,12 @@ class PlannedMotionCheck(Published):
 
 
 class CourseCheck(Published):
-    """A smooth course, whose changes of velocity take time."""
+    """A smooth course: one whose velocity changes take time."""
 
     duration_s: float
-    """When the last waypoint is reached or the last change is over."""
+    """When the last waypoint is reached or the last velocity change ends."""
     length_m: float | None
-    """Along the waypoints; None without."""
+    """Length along the waypoints; None without waypoints."""
     turns: int
     acceleration_max_m_s2: float
     jerk_max_m_s3: float
@@ -80,57 +80,57 @@ class ScenarioCheck(Published):
 
     expected_loop_delay_s: float
     effective_loop_delay_s: float | None
-    """The constant loop delay that decides about stability: over links with jitter or losses it is longer, because
-    older commands act on. Of the vehicle that it leaves least headroom; None if next to nothing arrives."""
+    """The constant loop delay of equal effect on stability: longer with jitter or losses, because older commands keep
+    acting. That of the vehicle left with the least headroom; None if next to nothing arrives."""
     effective_headroom: float | None
-    """The headroom at that delay."""
+    """That vehicle's headroom at that delay."""
     channels_not_included: bool
-    """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
+    """Whether datagrams queue for limited bandwidth; the expected loop delay does not include that wait."""
     outage_s: float | None
-    """The longest outage of a link during the flight, which no figure here includes; None without any."""
+    """The longest link outage during the flight, which no figure here includes; None without outages."""
     setpoint_gaps: float
-    """How often in the flight, over all vehicles, no set-point is expected to arrive for `safety.setpoint_timeout_s`,
-    so that a vehicle enters failsafe; without outages."""
+    """Expected number of gaps between set-points, over all vehicles and the whole flight, that exceed
+    `safety.setpoint_timeout_s` and so put a vehicle into failsafe. Outages are not counted."""
     delay_margin_s: float | None
-    """None if no delay makes the loop unstable; with prediction the upper end of the mismatch window."""
+    """None if no delay makes the loop unstable; with prediction, the upper end of the mismatch window."""
     assumed_delay_s: float | None
-    """The loop delay over which the station predicts, the expected one if it is measured; None without prediction."""
+    """The loop delay that the prediction assumes: the expected one if it is measured in flight. None without one."""
     mismatch_window_s: tuple[float, float] | None
-    """The least and the largest loop delay at which the predicted loop is stable; None without prediction, or if there
-    is no largest."""
+    """The shortest and the longest loop delay at which the predicted loop is stable; None without prediction, or if no
+    delay is too long."""
     headroom: float | None
-    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
-    any margin."""
+    """1 - expected loop delay / margin; with prediction, 1 - mismatch / distance to that end of the window. The least
+    of all vehicles; None without a margin."""
     loop_delay_s_p99: float
-    """The loop delay that 99 % of the set-points keep, over the slowest links, at the worst phase of the ticks."""
+    """The 99th percentile of the loop delay over the slowest links, at the worst phase of the ticks."""
     headroom_p99: float | None
-    """The headroom that 99 % of the set-points keep, of the vehicle that has the least; None without any margin."""
+    """The headroom that 99 % of the set-points keep, for the vehicle with the least; None without a margin."""
     closest_m: float | None
-    """Least distance between two vehicles in their places over the flight; None for a single vehicle."""
+    """Least distance during the flight between the places of two vehicles; None for a single vehicle."""
     closest_s: float | None
-    """When they are that close."""
+    """When the places are that close."""
     course: CourseCheck | None
-    """None with steps of the nominal velocity."""
+    """None if the nominal velocity changes in steps."""
     planned: tuple[PlannedMotionCheck, ...]
-    """Of each vehicle, if the formation manoeuvres."""
+    """One for each vehicle if the formation manoeuvres."""
     vehicles: tuple[VehicleCheck, ...]
     response_known: bool
-    """False for autopilots, which are identified in flight, unless the scenario has their response: margins and
-    headroom are then those of vehicles that respond at once, and less in flight."""
+    """False for autopilots, which are identified in flight, unless the scenario gives their response. Margins and
+    headroom then assume vehicles that respond at once; in flight they are less."""
     response_differs: dict[str, tuple[float | None, float | None]]
-    """The keys in which the given `response` differs from the simulated `autopilot`: the value of each."""
+    """For each key in which the given `response` differs from the simulated `autopilot`, both values in this order."""
     code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
-    """The code that would be run: its file by the key that names it."""
+    """The code that would run: the file by the scenario key that names it."""
 
     @property
     def least_headroom(self) -> float | None:
-        """The least of `headroom_p99` and `effective_headroom`; None if either is, as where next to nothing arrives."""
+        """The lesser of `headroom_p99` and `effective_headroom`; None if either is, as when next to nothing arrives."""
         found = self.headroom_p99, self.effective_headroom
         return None if None in found else min(own for own in found if own is not None)
 
 
 def check(plan: FlightPlan) -> ScenarioCheck:
-    """The vehicles of a plan at the start, and the headroom that the scenario's links leave."""
+    """Check a plan: its vehicles at the start, and the headroom over the scenario's links."""
     scenario, formation, model = plan.scenario, plan.formation, plan.model
     ordered = scenario.leader_first()
     place = formation.place_ne_m()
@@ -199,14 +199,14 @@ def check(plan: FlightPlan) -> ScenarioCheck:
 
 
 def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
-    """The loop delay over which the station predicts at a loop delay; 0 without prediction."""
+    """The delay over which the station predicts when the loop delay is `delay_s`; 0 without prediction."""
     return delay_s if plan.scenario.control.prediction == "measured" else plan.assumed_s or 0.0
 
 
 def _headroom(plan: FlightPlan, row: int, delay_s: float, expected_s: float) -> float:
-    """What a loop delay leaves of a vehicle's margin; with prediction of the distance to the window's end.
+    """A vehicle's headroom at a loop delay, to its margin or, with prediction, to the end of its mismatch window.
 
-    A prediction over the measured delay assumes the expected one.
+    A prediction over the measured delay assumes the expected one, `expected_s`.
     """
     assumed_s = _assumed_s(plan, expected_s)
     tolerated = plan.tolerance_of(row, assumed_s)
@@ -214,11 +214,11 @@ def _headroom(plan: FlightPlan, row: int, delay_s: float, expected_s: float) -> 
 
 
 def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | None:
-    """The headroom that most set-points keep.
+    """The headroom that the share `_LATE` of the set-points keep, for the vehicle with the least.
 
-    With prediction the age of a state is known, so only a set-point that acts at another instant than assumed is a
-    mismatch. A measured delay is assumed to be the mean, and includes the wait for the tick. With a given one that
-    wait, which is the same throughout a flight, may be shorter or longer than on average.
+    With prediction the age of a state is known; a mismatch arises only if the set-point acts earlier or later than
+    assumed. A measured delay is taken as its mean, which includes the wait for the tick. A given delay assumes the
+    average wait, but the actual wait, constant throughout a flight, may be up to half a period shorter or longer.
     """
     prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
     rates = plan.scenario.rates
@@ -235,13 +235,13 @@ def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | N
 
 
 def _kept(mismatch_s: FloatArray, tolerated: Tolerated) -> float:
-    """The headroom that most of these mismatches (phases, k) keep, at the worst phase."""
+    """The headroom that the share `_LATE` of these mismatches (phases, k) keep, at the worst phase."""
     used_s = np.vectorize(partial(tolerated.used_s, 0), [float])(mismatch_s)
     return headroom(float(np.quantile(used_s, _LATE, axis=1, method="higher").max()), tolerated.longer_s[0])
 
 
 def _outages_s(scenario: Scenario) -> Iterator[float]:
-    """The outages of all links, as long as they last during the flight."""
+    """Durations of all link outages, cut off at the end of the flight."""
     for vehicle in scenario.vehicles:
         for link in scenario.link_of(vehicle.system_id):
             for outage in link.outages:

@@ -1,6 +1,6 @@
 """Flies a plan to its end, in virtual time or in real time as `gcs fly` does, and returns its log.
 
-In real time the load of the machine is measured, too.
+In real time it also measures the load of the machine.
 """
 
 import errno
@@ -27,16 +27,16 @@ from scenarios.networks import networks_of
 from sim_vehicles.links.truth import MemoryRecorder
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7
-"""Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
+"""Indices in the cpu line of /proc/stat: idle, iowait (idle while a disk is busy), and steal (taken by the host)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
     """A flight's log, in real or virtual time.
 
-    `truth` holds when states were sampled and set-points acted, recorded by the vehicles; in virtual time only on
-    request. In real time only, `steal_share` is the fraction of the processor time that the host took away, and
-    `busy_share` the fraction in which processors were not idle.
+    `truth` is the vehicles' record of when states were sampled and set-points acted; in virtual time it is kept only on
+    request. `steal_share` is the fraction of processor time taken by the host, `busy_share` the fraction in which
+    processors were neither idle nor waiting for a disk; both are measured in real time only.
     """
 
     ticks: TickArray
@@ -51,8 +51,8 @@ def fly_plan(
 ) -> Flight:
     """Fly a plan, in virtual time or in real time.
 
-    With a folder, which is created, the run's files except the summary are left there. In real time the vehicles' truth
-    is always recorded.
+    If a folder is given, it is created and receives the run's files; in virtual time these do not include the summary.
+    In real time the vehicles' truth is always recorded.
     """
     if real_time:
         return fly_real_time(plan, margins_of(plan), folder)
@@ -77,7 +77,7 @@ def fly_plan(
 
 
 def identified_in_flight(plan: FlightPlan) -> FlightPlan:
-    """The plan with the responses of its simulated autopilots, identified in virtual time, and the margins with them.
+    """Identify the responses of simulated autopilots in virtual time; returns the plan with them in its margins.
 
     A plan whose responses are given, or whose vehicles respond at once, is returned unchanged. Raises InputError with
     the reason if the formation flight does not begin.
@@ -92,8 +92,8 @@ def identified_in_flight(plan: FlightPlan) -> FlightPlan:
 
 
 def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flight:
-    """Fly a plan in real time. With a folder, which is created, the run is left there; otherwise it is deleted."""
-    from gcs.drive.fly import fly  # processes and sockets: not for flights in virtual time
+    """Fly a plan in real time and leave the run in a folder, created if missing; without a folder it is deleted."""
+    from gcs.drive.fly import fly  # processes and sockets, which flights in virtual time do not need
     from gcs.drive.udp import StationSocket
 
     kept = folder is not None
@@ -122,13 +122,13 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
 
 
 def _processor_times() -> IntArray:
-    """Time of all processors since boot, in jiffies: user, nice, system, idle, iowait, irq, softirq, steal."""
+    """Time of all processors together since boot, in jiffies: user, nice, system, idle, iowait, irq, softirq, steal."""
     line = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0]
     return np.array(line.split()[1:9], dtype=np.int64)
 
 
 def margins_of(plan: FlightPlan) -> Design:
-    """The part of a design that a run's files need; the margin of the continuous model is in the campaign's report."""
+    """The minimal design for a run's files: only the sampled margin. The campaign's report has the continuous one."""
     if why := why_unknown(plan):
         return Design(delay_margin_s=None, margin_unknown=why)
     return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
@@ -140,7 +140,7 @@ def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, 
 
 
 def median_ages_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
-    """Median age of each vehicle's states at their first use, as the station believes it; 0 if it was not commanded."""
+    """Median age of each vehicle's states at their first use, as the station estimates it; 0 if never commanded."""
     return _medians(ticks, ticks["telemetry_age_s"] - ticks["repeated_s"], system_ids)
 
 
@@ -154,6 +154,6 @@ def _medians(ticks: TickArray, values: FloatArray, system_ids: tuple[int, ...]) 
 
 
 def first_uses(ticks: TickArray) -> TickArray:
-    """The rows that use a state for the first time: all rows, unless telemetry is slower than control, or lost."""
+    """The rows that use a state for the first time: all rows, unless telemetry is lost or slower than control."""
     _, first = np.unique(ticks[["system_id", "sample_boot_ms"]], return_index=True)
     return ticks[np.sort(first)]

@@ -1,4 +1,4 @@
-"""One flight, in real or virtual time: start the vehicles, fly, record, summarise."""
+"""Runs one flight, in real or virtual time: starts the vehicles, flies, records and summarises."""
 
 import contextlib
 import os
@@ -48,14 +48,14 @@ def fly(
 ) -> Summary:
     """Fly a designed scenario in real time, write the run to the folder, and return its summary.
 
-    `show_table` shows the live table, or plain lines without a terminal. `fleet` says who provides the vehicles; if it
-    is empty, this flight starts simulated ones. These sign with `key_file`; with `outlive_station` they wait to be
+    `show_table` shows the live table, or plain lines without a terminal. `fleet` says where the vehicles come from; if
+    it is empty, this function starts simulated ones, which sign with `key_file`. With `outlive_station` these can be
     taken over if this process is killed. `viewer` is the URL of a Rerun viewer that shows the flight.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
         prepare(plan)
-        # Contexts end in reverse: first the vehicles, then the observer finishes the recording.
+        # Contexts exit in reverse order: the vehicles stop first, then the observer finishes the recording.
         with _observer(folder, viewer, show_table=show_table) as observer, contextlib.ExitStack() as started:
             vehicles: VehicleProcess | None = None
             if not fleet:
@@ -82,7 +82,7 @@ def fly(
 
             try:
                 drive(station, link, writer, stop, new_plan, mirror)
-                if station.plan is not plan:  # now add the figures that take too long to compute in flight
+                if station.plan is not plan:  # add the figures that take too long to compute in flight
                     _write_design(writer, folder, described(design, station.plan))
                 writer.event(
                     Event(time_s=station.scenario_time_s(clock_ns()), kind=record.END, text=station.end_reason)
@@ -92,7 +92,7 @@ def fly(
                 raise
             finally:
                 unwritten = writer.close()
-            if unwritten:  # the observer would wait for the last event, which is among them
+            if unwritten:  # among these is the "end" event, for which the observer would wait
                 observer.terminate()
         return finish(folder, unwritten=unwritten)
 
@@ -106,15 +106,14 @@ def fly_in_virtual_time(
     speed: float | None = None,
     viewer: str | None = None,
 ) -> Summary:
-    """Fly on one virtual clock, with the same files as in real time; returns the summary.
+    """Fly on one virtual clock, write the same files as in real time, and return the summary.
 
-    `speed` is the largest number of virtual seconds per second of real time; None sets no limit. `viewer` is as for
-    `fly`.
+    `speed` limits the virtual seconds per second of real time; None sets no limit. `viewer` is as for `fly`.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
         with _observer(folder, viewer, show_table=show_table) as observer:
-            if speed is not None:  # otherwise the observer catches up with the flight
+            if speed is not None:  # without a limit the observer simply catches up
                 _wait_until_ready(observer, folder, asked_to_stop)
             station = Station(plan, start_ns=START_NS)
             writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / record.TRUTH_FILE)
@@ -147,7 +146,7 @@ def fly_in_virtual_time(
 
 
 def _note_design(writer: RunWriter, folder: Path, design: Design, found: FlightPlan, time_s: float) -> None:
-    """Write the design again with the responses that identification found, and record that as an event."""
+    """Rewrite the design with the responses found by identification, and log an event about it."""
     _write_design(writer, folder, identified(design, found))
     text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
     writer.event(Event(time_s=time_s, kind=record.NEW_DESIGN, text=text))
@@ -161,7 +160,7 @@ def _write_design(writer: RunWriter, folder: Path, design: Design) -> None:
 
 
 def new_folder(scenario_name: str) -> Path:
-    """A new folder for a run in runs/, named after the scenario and the local time."""
+    """Create a folder for a run in runs/, named after the scenario and the local time."""
     stem = f"{scenario_name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for end in ("", *(f"-{count}" for count in range(2, 1000))):
         with contextlib.suppress(FileExistsError):
@@ -172,11 +171,11 @@ def new_folder(scenario_name: str) -> Path:
 
 @contextlib.contextmanager
 def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
-    """The process that shows and records the flight; it has ended when the context is left."""
+    """Run the process that shows and records the flight; leaving the context waits until it has ended."""
     command = [sys.executable, "-m", "gcs.views.observer", str(folder), "--parent", str(os.getpid())]
     command += [] if show_table else ["--no-table"]
     command += [] if viewer is None else ["--viewer", viewer]
-    with held_back():  # once started, it ignores Ctrl-C by itself
+    with held_back():  # the observer ignores Ctrl-C itself once it has started
         process = subprocess.Popen(command, stdin=subprocess.PIPE)
     try:
         yield process
@@ -185,8 +184,8 @@ def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generato
         process.wait(_OBSERVER_PATIENCE_S)
         raise
     assert process.stdin is not None
-    process.stdin.close()  # all is written
-    for end in (process.terminate, process.kill):  # if it does not end by itself after the last event
+    process.stdin.close()  # tells it that everything is written
+    for end in (process.terminate, process.kill):  # in case it does not exit after the last event
         try:
             process.wait(_OBSERVER_PATIENCE_S)
         except subprocess.TimeoutExpired:
@@ -195,6 +194,6 @@ def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generato
 
 
 def _wait_until_ready(observer: "subprocess.Popen[bytes]", folder: Path, asked_to_stop: Callable[[], str]) -> None:
-    """Wait for the observer's slow imports, which would otherwise compete with the first ticks for the processor."""
+    """Wait until the observer's slow imports are done; they would compete with the first ticks for the processor."""
     while observer.poll() is None and not (folder / record.READY_FILE).exists() and not asked_to_stop():
         time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Signing at the station's socket: verified datagrams in, signed ones out. The station itself does not sign."""
+"""Signs and verifies datagrams at the station's socket; the station itself handles only unsigned frames."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -13,16 +13,16 @@ from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps, open_stamps
 
 LINK_ID, MIRROR_LINK_ID = 0, 1
-"""Link ids of the socket to the vehicles and of the socket to another station."""
+"""Signing link ids of the socket to the vehicles and of the socket to another station."""
 
 
 class Guard:
-    """Signs what the station sends; verifies what it receives and removes the signatures."""
+    """Signs outgoing datagrams; verifies incoming ones and removes their signatures."""
 
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
         self._end = partial(SignedLink, key, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
         self._links: dict[int, SignedLink] = {}
-        """The ends of the links to the networks that were heard or sent to."""
+        """The station's end of the link to each network, created when a network is first heard or sent to."""
         self.mirror_link = self._end(link_id=MIRROR_LINK_ID)
 
     def _link(self, network: int) -> SignedLink:
@@ -37,9 +37,9 @@ class Guard:
         refused: Counter[str],
         is_another: Callable[[int, Datagram], bool] | None = None,
     ) -> list[Datagram]:
-        """The datagrams with their verified frames only; refused ones are counted by reason.
+        """The datagrams reduced to their verified frames; refused frames are counted by reason.
 
-        `is_another` says whether a datagram claims a system id but comes from another address, see `Station`.
+        `is_another` says whether a datagram claims a known system id from another address, see `Station`.
         """
         verified: list[Datagram] = []
         for datagram in datagrams:
@@ -57,7 +57,7 @@ class Guard:
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
-    """The guard with the key in a file; the timestamps it has seen are kept beside that file, one file for each role.
+    """A guard with the key in a file. Signing timestamps are kept beside that file, in one file for each role.
 
     Raises KeyFileError if one of the files cannot be used.
     """

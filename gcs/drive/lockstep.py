@@ -1,8 +1,8 @@
-"""Vehicles, links and station on one virtual clock in one process: the same code and bytes as in real time.
+"""Vehicles, links and station on one virtual clock in one process, running the same code and bytes as in real time.
 
 The same plan gives the same ticks to the last bit. Nothing sleeps, so a flight takes only its computing time. The
-station is called when something of its own is due. Datagrams that arrive earlier wait with their receive stamps, as in
-a socket; the station decides nothing in between.
+station is called when one of its own events is due. Datagrams that arrive earlier wait with their receive stamps, as in
+a socket buffer, because the station decides nothing between its events.
 """
 
 import gc
@@ -35,32 +35,32 @@ from sim_vehicles.drive.guard import signed_links
 from sim_vehicles.links.truth import LINK_UP, Recorder, TruthLog
 
 START_NS = 1_000_000_000
-"""Virtual time at which vehicles and station start; not zero, so that a forgotten time is noticed."""
+"""Virtual time at which vehicles and station start. It is not zero, to expose times that were never set."""
 EPOCH_NS = 1_800_000_000 * 1_000_000_000
 """Virtual time 0 of a signed flight, in ns since 1970."""
 _HOST = "virtual"
 _FLIGHTS_A_COLLECTION = 100
-"""Flights after which garbage is collected: freezing postpones that, in campaigns of short flights for ever."""
+"""Flights between garbage collections. Freezing postpones them, in campaigns of short flights indefinitely."""
 _flights = count(1)
 _TICKS_TO_PREPARE, _STEPS_TO_PREPARE = 10, 20
 
 Sent = Datagrams | list[Datagram]
-"""Datagrams from or to vehicles: arrays, or a list; iterated over, both give (system id, bytes, time in ns)."""
+"""Datagrams from or to vehicles, as arrays or as a list. Iterating over either gives (system id, bytes, time in ns)."""
 
 
 class Vehicles(Protocol):
-    """The vehicles behind their links: `step` takes the station's datagrams and returns those that reach it."""
+    """The vehicles and their links: `step` takes the station's datagrams and returns those that reach the station."""
 
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
 def vehicles_of(scenario: Scenario, *, recorder: Recorder | None = None) -> Fleet:
-    """The simulated vehicles of a scenario and their links, at the start."""
+    """The simulated vehicles of a scenario and their links, in their initial state."""
     return Fleet(scenario, START_NS, recorder=recorder)
 
 
 class RecordedVehicles:
-    """The simulated vehicles of a plan, logged as in real time: their truth, and the frames sent to them."""
+    """The simulated vehicles of a plan, logged as in real time: records their truth and the frames sent to them."""
 
     def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
         self._log, self._truth = TruthLog(truth_file), Recorder(self._write)
@@ -82,12 +82,12 @@ class RecordedVehicles:
 
     def _write(self, records: Records) -> None:
         up = records["kind"] == LINK_UP
-        records["time_ns"][up] = records["due_ns"][up]  # logged as leaving when due, though it is computed later
+        records["time_ns"][up] = records["due_ns"][up]  # a datagram leaves when it is due, although computed later
         self._log.write(records)
 
 
 def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
-    """The vehicles of `vehicles_of` and the guard of their station, with one key and no memory of earlier flights."""
+    """Signing vehicles and the guard of their station, with one key and no timestamps from earlier flights."""
     links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())
     vehicles = Fleet(plan.scenario, START_NS, signed=links)
     return vehicles, Guard(key, epoch_ns=EPOCH_NS, stamps=Stamps())
@@ -95,7 +95,7 @@ def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
 
 @dataclass
 class _Joining:
-    """Vehicles of which each packs all its frames of a step into one datagram, as real ones may."""
+    """Vehicles that each pack all frames of a step into one datagram, as real vehicles may."""
 
     vehicles: Vehicles
 
@@ -107,7 +107,7 @@ class _Joining:
 
 
 def prepare(plan: FlightPlan) -> None:
-    """Fly the beginning of a plan with plain vehicles and links, so that nothing needs to be compiled in real time."""
+    """Compile all kernels before a flight in real time, by flying the beginning of the plan with plain vehicles."""
     plain = {"dynamics": "double_integrator", "links": Links(), "response": None}
     control = plan.scenario.control.model_copy(update={"execute_at": False})
     scenario = plan.scenario.model_copy(update=plain | {"control": control})
@@ -134,15 +134,15 @@ def fly_lockstep(
 ) -> Iterator[TickArray]:
     """Fly a plan in virtual time; yields the rows (a fresh copy) of each control tick.
 
-    With `ahead`, which is faster, the rows of several ticks may come together, and the station may be further than
-    these: for those who only collect them.
+    `ahead` is faster: the rows of several ticks may be yielded together, and the station may be ahead of them. It suits
+    callers that only collect rows.
 
     Pass a station to read its events and end reason afterwards, vehicles to continue an earlier flight, and a guard to
     sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id, its network).
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan.scenario)
-    gc.freeze()  # garbage collection need not scan what exists already
+    gc.freeze()  # exempts all existing objects from garbage collection
     try:
         yield from _ticks(plan, station, vehicles, guard, ahead)
     finally:
@@ -152,14 +152,14 @@ def fly_lockstep(
 
 
 class _Bridge:
-    """Passes datagrams between a station and vehicles, whose rows are in order of system id."""
+    """Converts datagrams between a station and vehicles, whose rows in the fleet are in order of system id."""
 
     def __init__(self, system_ids: Sequence[int]) -> None:
         self._ids = sorted(system_ids)
         self.addresses: list[Address] = [(_HOST, key, network_of(key)) for key in self._ids]
         self._row = {address: row for row, address in enumerate(self.addresses)}
         self.rows = np.array([self._ids.index(key) for key in system_ids])
-        """Those of the station's vehicles."""
+        """The row in the fleet of each of the station's vehicles."""
 
     def arrivals(self, sent: Datagrams) -> Arrivals:
         return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self.addresses)
@@ -182,7 +182,7 @@ def _ticks(
     fleet = vehicles if plain and isinstance(vehicles, Fleet) and vehicles.is_usual else None
     usual = None if fleet is None else UsualSteps(station, fleet, bridge.addresses, bridge.rows, ahead=ahead)
     while station.phase is not Phase.ENDED:
-        # vehicles look for the set-point at which the time of their links begins; there is none while CONNECTING
+        # `Fleet.step` looks for the first set-point, at which link time begins; none is sent while CONNECTING
         usual_now = fleet is not None and (fleet.knows_link_time or station.phase is Phase.CONNECTING)
         if usual is not None and usual_now and isinstance(to_vehicles, Datagrams):
             now_ns, arrived, taken = yield from usual.fly(to_vehicles)

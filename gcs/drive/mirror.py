@@ -1,7 +1,7 @@
-"""Streams a flight to another ground station: the frames of vehicles and station, as raw MAVLink.
+"""Mirrors a flight to another ground station: all frames of the vehicles and of this station, as raw MAVLink.
 
-By default it is read-only: what the other station sends is counted and dropped. Nothing waits for the other station; if
-nobody listens, that is counted.
+By default it is read-only: frames from the other station are counted and dropped. Sending never blocks; frames that the
+other station cannot take are counted.
 """
 
 import contextlib
@@ -18,15 +18,15 @@ from scenarios.signing.link import SignedLink
 
 _LARGEST_DATAGRAM = 2048
 _STREAMS_WITH_POSITION = (0, 6)
-"""MAV_DATA_STREAM: all, position."""
+"""MAV_DATA_STREAM_ALL and MAV_DATA_STREAM_POSITION."""
 _DATAGRAMS_A_STEP = 64
-"""Datagrams read from the other station per step. The rest waits; the kernel drops what exceeds its buffer."""
+"""Most datagrams read from the other station per step. Others wait; the kernel drops what exceeds its buffer."""
 
 
 class Mirror:
-    """A socket connected to another ground station; with `commands`, its frames are passed on to the vehicles.
+    """A socket connected to another ground station; with `commands`, that station's frames are passed to the vehicles.
 
-    All vehicles are of one network, as the other station knows them by their ids in frames.
+    All vehicles must be in one network, because the other station tells them apart by the system ids in frames.
 
     On a signed link, frames to the other station are signed and its own are accepted only if signed. Raises OSError if
     the address cannot be used.
@@ -52,21 +52,21 @@ class Mirror:
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:
-        """Send frames to the other station, unchanged or signed for this link."""
+        """Send frames to the other station, unchanged or, on a signed link, signed."""
         for frame in frames:
             try:
                 # Signing needs MAVLink 2.
                 self._socket.send(frame if self._signed is None else self._signed.sign(frame, now_ns))
                 self.counters["forwarded"] += 1
-            except OSError:  # an earlier datagram met a closed port, or the buffer is full
+            except OSError:  # nobody listened to an earlier datagram, or the buffer is full
                 self.counters["not forwarded"] += 1
 
     def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
-        """Frames of the other station that may pass, each to the vehicle it is addressed to, or to all.
+        """The permitted frames of the other station, each for the vehicle it is addressed to, or for all.
 
-        They go only to vehicles already in flight: one that was never commanded would accept the other station as its
-        own. Requests that change the rate of the telemetry used for control are refused: displays ask for a few
-        positions a second when they connect.
+        They go only to vehicles in guided flight: one that was never commanded would accept the other station as its
+        own. Requests that change the rate of the telemetry used for control are refused, because displays ask for only
+        a few positions a second when they connect.
         """
         own = {vehicle.wire_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []
@@ -89,7 +89,7 @@ class Mirror:
         frames: list[mavlink.Frame] = []
         with contextlib.suppress(BlockingIOError):
             for _ in range(_DATAGRAMS_A_STEP):
-                with contextlib.suppress(ConnectionError):  # an earlier datagram met a closed port
+                with contextlib.suppress(ConnectionError):  # nobody listened to an earlier datagram
                     data = self._socket.recv(_LARGEST_DATAGRAM)
                     refused: Counter[str] = Counter()
                     if self._signed is not None:
@@ -100,7 +100,7 @@ class Mirror:
 
 
 def _sets_our_rate(frame: mavlink.Frame) -> bool:
-    """Whether a frame asks for LOCAL_POSITION_NED at a rate, alone or with a stream of messages."""
+    """Whether a frame sets the rate of LOCAL_POSITION_NED, alone or as part of a stream."""
     name = mavlink.message_name(frame.msg_id)
     if name not in ("REQUEST_DATA_STREAM", "COMMAND_LONG", "COMMAND_INT"):
         return False

@@ -1,6 +1,6 @@
-"""Checks before take-off: whether a scenario or its plan can fly at all.
+"""Checks before take-off that a scenario and its plan can fly at all.
 
-Each check returns a fault in one line (the scenario's key, what was read, what was wanted), or None.
+Each check returns one fault as one line (the scenario's key, what was read, what was wanted), or None.
 """
 
 from dataclasses import replace
@@ -24,11 +24,11 @@ from scenarios.schema import NS_PER_S, Scenario
 
 
 def unstable_loop(plan: FlightPlan) -> str | None:
-    """The fault of a loop that is unstable even without delay; None if the loop has a delay margin, or it is unknown.
+    """The fault of a loop that is unstable even without delay; None if it has a delay margin, or an unknown one.
 
     It names the unstable root of the continuous loop, or the growth rate of a loop that only sampling destabilises.
     """
-    if not plan.delay_margin_s <= 0.0:  # nor is NaN: an unknown margin
+    if not plan.delay_margin_s <= 0.0:  # also true of NaN, an unknown margin
         return None
     control = plan.scenario.control
     key = "control.blocks" if control.blocks else "control.gains" if control.gains is not None else "control"
@@ -44,13 +44,13 @@ def unstable_loop(plan: FlightPlan) -> str | None:
 
 
 def without_actions(plan: FlightPlan) -> FlightPlan:
-    """The plan with a monitor that does not act: there is no margin to keep."""
+    """The plan with a monitor that only watches, for a loop without a margin to keep."""
     monitor = plan.scenario.monitor.model_copy(update={"act": False})
     return replace(plan, scenario=plan.scenario.model_copy(update={"monitor": monitor}))
 
 
 def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:
-    """The rightmost root of the continuous loop without delay, and the vehicles of the coupled loop it belongs to."""
+    """The rightmost root of the continuous loop without delay, and the vehicles of the coupled block it belongs to."""
     model, ids = plan.model, plan.formation.system_ids
     A, B, K = _matrices(plan)
     closed = A + B @ K
@@ -71,17 +71,17 @@ def _sampled_growth_1_s(plan: FlightPlan) -> float:
 
 
 def _matrices(plan: FlightPlan) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A, B and K of the loop flown, including the vehicles' responses if known."""
+    """A, B and K of the loop as flown, with the vehicles' responses if these are known."""
     if plan.responses is None:
         return plan.model.A, plan.model.B, plan.gain
     return formation_loop(plan.model, plan.gain, plan.responses.in_order(plan.formation.system_ids))
 
 
 def bad_start(scenario: Scenario) -> str | None:
-    """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit.
+    """The fault of a start that violates a safety limit at the first tick: a collision, or too large a spacing error.
 
-    Also a speed that simulated vehicles with an autopilot cannot fly.
-    Also places that are too close to each other, over the whole flight.
+    It also refuses a nominal or course speed that simulated autopilots cannot fly, and places that are too close
+    together at any time in the flight.
     """
     safety, vehicles, offset_ne_m = scenario.safety, scenario.leader_first(), plan_formation(scenario).offset_ne_m
     for one, two in combinations(vehicles, 2):
@@ -112,7 +112,7 @@ def bad_start(scenario: Scenario) -> str | None:
 
 
 def _close_places(scenario: Scenario) -> str | None:
-    """Places of two vehicles that are too close to each other, in the formation or during a change of it."""
+    """The fault of two places that are too close to each other, in the formation or during a formation change."""
     nearest, least_m = nearest_planned(scenario), scenario.safety.collision_distance_m
     if nearest is None or nearest.distance_m >= least_m:
         return None
@@ -125,7 +125,7 @@ def _close_places(scenario: Scenario) -> str | None:
 
 
 def endless_link(scenario: Scenario) -> str | None:
-    """A link that loses everything, or is too slow for the flight to begin, or for any command from one of its states.
+    """The fault of a link that loses everything, or is too slow for the flight to begin or for any command to act.
 
     A TIMESYNC reply that arrives after its request has expired is ignored, so no clock would ever be known.
     """

@@ -1,4 +1,4 @@
-"""Runs the simulated vehicles of a flight in a process of their own."""
+"""Runs the simulated vehicles of a flight in their own process."""
 
 import os
 import subprocess
@@ -11,16 +11,16 @@ from gcs.runs.refusals import VEHICLES_FILE
 
 VEHICLES_LOG = "vehicles.log"
 ORPHAN_S = 60.0
-"""How long vehicles whose station was killed fly on and wait for another one."""
+"""How long vehicles whose station was killed fly on and wait for another station."""
 _AT_ONCE_S = 0.1
 _STOP_PATIENCE_S = 5.0
 
 
 class VehicleProcess:
-    """The simulated vehicles of a scenario as a child process; it ends when the context is left.
+    """The simulated vehicles of a scenario in a child process, which is ended on leaving the context.
 
-    With `outlive_station`, vehicles whose station is killed fly on in their failsafe and can be taken over. They end
-    when no station has commanded them for ORPHAN_S. Otherwise they end with this process.
+    With `outlive_station`, vehicles whose station is killed fly on in failsafe and can be taken over. They end once no
+    station has commanded them for ORPHAN_S. Without it they end with this process.
     """
 
     def __init__(
@@ -42,10 +42,10 @@ class VehicleProcess:
                     "--stop-after-silence", str(ORPHAN_S if outlive_station else _AT_ONCE_S),
                     "--counters", str(folder / VEHICLES_FILE),
                     *([] if key_file is None else ["--key", str(key_file)]),
-                    "--allow-code",  # this process may run it, or it would not have come here
+                    "--allow-code",  # already permitted to this process, or it would not have come this far
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C goes to the station only, which brings them to safety first
+                start_new_session=True,  # Ctrl-C reaches only the station, which brings them to safety first
             )  # fmt: skip
 
     @property
@@ -53,7 +53,7 @@ class VehicleProcess:
         return self._process.pid
 
     def complaint(self) -> str:
-        """Why the vehicles' process ended by itself, in its last words; empty while it lives or if it was killed."""
+        """The last line that the vehicles' process logged if it failed; empty while it runs, or if it was killed."""
         if (self._process.poll() or 0) <= 0:
             return ""
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")

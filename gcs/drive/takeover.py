@@ -1,8 +1,8 @@
-"""Takes over vehicles that already send to the station before its flight, if they fly the same experiment.
+"""Takes over vehicles that are already sending to the station before its flight, if they fly the same experiment.
 
 Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
 take them over: otherwise its verdict would be about another experiment. Each vehicle names its scenario in the extended
-parameter SCENARIO, which other ground stations do not ask for.
+parameter SCENARIO, which other ground stations do not request.
 """
 
 from collections import Counter
@@ -22,18 +22,18 @@ TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
 _SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
-"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even doing
-nothing restarts the minute for which vehicles fly on without a station."""
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even the first
+restarts the minute for which vehicles fly on without a station."""
 _HEARTBEAT_PERIOD_S = 1.2
-"""Vehicles already in flight are heard within this time."""
+"""Time within which vehicles already in flight are heard."""
 _ASK_AGAIN_NS = NS_PER_S // 4
 _LEAST_PATIENCE_S = 3.0
 _ROUND_TRIPS = 4.0
-"""Answers are awaited for this many round trips of the links, but at least for the time above."""
+"""Timeout for answers, in round trips of the links; at least `_LEAST_PATIENCE_S`."""
 
 
 class Presence:
-    """The vehicles of a scenario that already send to the station's socket before its flight."""
+    """The vehicles of a scenario that are already sending to the station's socket before its flight."""
 
     def __init__(self, link: StationSocket, scenario: Scenario) -> None:
         self._link = link
@@ -43,9 +43,9 @@ class Presence:
         self._sequence = 0
 
     def taken_over(self) -> list[int]:
-        """The system ids of the vehicles that are present and to be flown; empty if there are none.
+        """Take over the vehicles that are present; returns their system ids, empty if there are none.
 
-        Raises InputError if the vehicles present fly another scenario, or do not say which.
+        Raises InputError if they fly another scenario, do not say which, or do not obey.
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
@@ -60,7 +60,7 @@ class Presence:
         return there
 
     def shut_down(self) -> None:
-        """End the processes of the vehicles taken over. A vehicle whose own station is alive does not obey."""
+        """Shut down the vehicles taken over. A vehicle whose own station is alive does not obey."""
         self._command(sorted(self._addresses), _SHUT_DOWN)
 
     def _command(self, system_ids: list[int], wanted: float) -> list[int]:
@@ -79,10 +79,10 @@ class Presence:
         fields: Callable[..., tuple[object, ...]],
         answer: Callable[[mavlink.Frame], str],
     ) -> dict[int, str]:
-        """Each vehicle's answer to a message, which is repeated until the answer arrives or time is up.
+        """Each vehicle's answer to a message, which is resent until the answer arrives or the timeout expires.
 
-        `fields` gives the fields of the message for a `target_system`; `answer` is the text in a frame, "" if it is no
-        answer.
+        `fields` makes the fields of the message for a `target_system`; `answer` extracts the text from a frame, "" if
+        the frame is no answer.
         """
         said: dict[int, str] = {}
         left = set(system_ids)
@@ -102,12 +102,12 @@ class Presence:
         return said
 
     def _listen(self, until_ns: int) -> list[mavlink.Frame]:
-        """The frames received until a time from vehicles of the scenario, whose addresses are noted."""
+        """The frames received until a time from vehicles of the scenario; notes the vehicles' addresses."""
         frames: list[mavlink.Frame] = []
         now_ns = 0
         while now_ns < until_ns:
             self._link.wait(until_ns)
-            now_ns = clock_ns()  # before reading, so that everything that arrived by then is received
+            now_ns = clock_ns()  # read before the socket: all that arrived by the deadline is then received
             for datagram in self._link.receive():
                 frames_in = mavlink.decode_either(datagram.data, Counter())
                 for frame in mavlink.in_network(frames_in, datagram.address[2]):
@@ -117,7 +117,7 @@ class Presence:
         return frames
 
     def _flown(self, text: str) -> str:
-        """In words, what the vehicles fly that gave this answer."""
+        """A phrase for what the vehicles that gave this answer are flying."""
         _, _, name = text.partition(" ")
         if not name:
             return "do not say which scenario they fly"
@@ -125,7 +125,7 @@ class Presence:
         return f"fly {name} with other links, another seed or other settings" if same else f"fly {name}"
 
     def _refusal(self, there: list[int], flown: str) -> str:
-        """The error, in one line: who is present, what they fly, and what the user can do."""
+        """The error as one line: who is present, what they fly, and what the user can do."""
         host, port = self._link.address
         who = f"vehicle{'s' * (len(there) > 1)} {' '.join(map(str, there))}"
         return (
@@ -135,7 +135,7 @@ class Presence:
 
 
 def _scenario_of(frame: mavlink.Frame) -> str:
-    """A vehicle's answer about its experiment: fingerprint and name of the scenario."""
+    """The fingerprint and name of the scenario in a vehicle's answer; "" if the frame is not that answer."""
     if frame.msg_id != mavlink.PARAM_EXT_VALUE:
         return ""
     name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in frame.fields[2:4])

@@ -1,4 +1,4 @@
-"""The station's real-time driver: one UDP socket, the monotonic clock, one select loop.
+"""The station's real-time driver: a UDP socket for each network, the monotonic clock, one select loop.
 
 The station itself reads no clock and touches no socket. Kernel receive stamps (SO_TIMESTAMPNS) say when a datagram
 arrived, so a busy station does not lengthen the delays that it measures.
@@ -29,17 +29,17 @@ from scenarios.networks import LAST_NETWORK
 from scenarios.sockets import Bytes, Ints, Reader, address_of, number_of, realtime_offset_ns, stamped, write
 
 _MOST_ADDRESSES = 8192
-"""Most addresses that are remembered: anybody may send."""
+"""Most addresses remembered; a limit is needed because anybody may send."""
 _NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
-"""Where the network is in an address's key, and the bits of `number_of`."""
+"""First bit of the network in an address's key, and the mask of the bits below, which hold its `number_of`."""
 _TOGETHER_NS = 8_000_000
-"""The station wakes for datagrams no sooner than this after it last woke: their stamps say when they arrived, and it
-decides only at ticks. Answers cannot wait longer: PX4 ignores one that comes more than 10 ms after it asked for the
-time."""
+"""Least time between two wake-ups for datagrams. Reading late costs nothing, because stamps say when datagrams arrived
+and decisions fall only at ticks. Answers cannot wait longer: PX4 ignores one that arrives over 10 ms after its TIMESYNC
+request."""
 _LONG_NS, _SOONER_NS = 500_000, 3_000_000
-"""If what it did when it last woke took longer than the first time, it wakes after the second."""
+"""If the work since the last wake-up took longer than the first time, the second replaces `_TOGETHER_NS`."""
 _BEFORE_TICK_NS = 2_000_000
-"""What has arrived is read this long before a tick. 250 vehicles send 30 datagrams in the time that is left."""
+"""How long before a tick the sockets are read. In the time left, 250 vehicles send 30 datagrams."""
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 
 
@@ -50,22 +50,22 @@ def clock_ns() -> int:
 
 @lru_cache(maxsize=_MOST_ADDRESSES)
 def _key(address: Address | None) -> int:
-    """An address and its network as one number; 0 for none."""
+    """An address and its network packed into one number; 0 for None."""
     return 0 if address is None else address[2] << _NETWORK_BIT | number_of(address[:2])
 
 
 class _Addresses:
-    """The addresses that datagrams came from or went to lately, numbered in the order in which they were `known`."""
+    """Recent addresses of senders and receivers; the number of each is its place in `known`."""
 
     def __init__(self) -> None:
         self.known: list[Address] = []
         self._numbers: dict[int, int] = {}
         self._vehicles: list[Address | None] = []
         self._keys = np.empty(0, np.int64)
-        """The addresses of all vehicles when they were last sent to, and their keys."""
+        """Cached keys of the addresses in `_vehicles`: those of all vehicles when they were last sent to."""
 
     def packed(self, outbox: Outbox) -> tuple[Bytes, Ints]:
-        """The datagrams as arrays, with the keys of their addresses."""
+        """The datagrams as a stream and a table, with the keys of their addresses."""
         return outbox.packed(_key, self._keys_of)
 
     def _keys_of(self, vehicles: Sequence[Address | None]) -> Ints:
@@ -74,7 +74,7 @@ class _Addresses:
         return self._keys
 
     def numbers(self, keys: Ints) -> Ints:
-        """The numbers of addresses, which may be new."""
+        """The number of each key's address; a new address is added."""
         if len(self.known) > _MOST_ADDRESSES:
             self.known, self._numbers = [], {}
         return np.array([*map(self._number, keys.tolist())], np.int64)
@@ -90,23 +90,23 @@ class _Addresses:
 class StationSocket:
     """A bound UDP socket for each network, with kernel receive stamps; with a guard, frames are signed and verified.
 
-    `port` is that of network 0, also if it has no vehicles; network k listens at the port k above. With port 0, free
-    ones are found. Raises OSError if an address cannot be bound.
+    `port` is that of network 0, even if that network has no vehicles; network k listens at `port` + k. With port 0,
+    free ports are found. Raises OSError if an address cannot be bound.
     """
 
     def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
         self.guard, self.networks = guard, networks
         self._reader, self._addresses = Reader(), _Addresses()
-        self._reader.read([])  # so that nothing is compiled in flight
+        self._reader.read([])  # compiles it before the flight
         self._sockets = _bound(host, port, networks)
         self._descriptors = np.zeros(LAST_NETWORK + 1, np.int64)
-        """By network."""
+        """Descriptor of each network's socket."""
         for network, own in self._sockets.items():
             self._descriptors[network] = own.fileno()
         self._read_from = self._descriptors[[*networks]]
         self._wait_for = self._read_from.tolist()
         self._networks = np.zeros(self._descriptors.max() + 1, np.int64)
-        """By descriptor."""
+        """Network of each descriptor."""
         self._networks[self._read_from] = networks
         self.bound_ns = self._woken_ns = clock_ns()
         self.send_errors = 0
@@ -121,13 +121,13 @@ class StationSocket:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where network 0 listens, or would."""
+        """The address at which network 0 listens, or would listen."""
         network, own = next(iter(self._sockets.items()))
         host, port = own.getsockname()
         return host, port - network
 
     def wait(self, until_ns: int) -> None:
-        """Wait until a datagram arrives or a time is reached; datagrams that follow closely are awaited together."""
+        """Wait until a datagram arrives or a time is reached; datagrams in quick succession cause one wake-up."""
         now_ns = clock_ns()
         left_ns, together_ns = until_ns - now_ns, _SOONER_NS if now_ns - self._woken_ns > _LONG_NS else _TOGETHER_NS
         if self._woken_ns + together_ns < until_ns:
@@ -140,12 +140,12 @@ class StationSocket:
     def receive(
         self, refused: Counter[str] | None = None, is_another: Callable[[int, Datagram], bool] | None = None
     ) -> Arrivals | list[Datagram]:
-        """All waiting datagrams, the oldest of each network first, with their arrival on the station's clock.
+        """All waiting datagrams, the oldest of each network first, with their arrival times on the station's clock.
 
-        `refused` and `is_another` are those of `Guard.received`.
+        `refused` and `is_another` are passed to `Guard.received`.
         """
         batch = self._reader.read(self._read_from)
-        self.send_errors += batch.errors  # an earlier datagram met a closed port; the vehicle will count as silent
+        self.send_errors += batch.errors  # a port was closed to an earlier datagram; the vehicle will count as silent
         table = batch.table[:4]
         table[2] = self._addresses.numbers(table[2] | self._networks[batch.table[4]] << _NETWORK_BIT)
         arrivals = Arrivals(batch.stream, table, batch.read_ns - table[3], self._addresses.known)
@@ -154,7 +154,7 @@ class StationSocket:
         return arrivals
 
     def send(self, outgoing: Outbox | Sequence[Outgoing]) -> Arrivals:
-        """Send datagrams; returns them, before they were signed, with when each was handed to the kernel."""
+        """Send datagrams; returns them unsigned, with the time at which each was handed to the kernel."""
         outbox = outgoing if isinstance(outgoing, Outbox) else Outbox(outgoing)
         return self._send(outbox) if len(outbox) else self._nothing
 
@@ -174,17 +174,17 @@ class StationSocket:
 
 
 def _bound(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
-    """The sockets of networks, see `StationSocket`."""
+    """The bound socket of each network, as described in `StationSocket`."""
     if port or len(networks) == 1:
         return _bound_at(host, port, networks)
     for _ in range(_PORTS_TO_TRY):
         with contextlib.suppress(OSError):
             return _bound_at(host, port, networks)
-    return _bound_at(host, port, networks)  # the error that comes now is reported
+    return _bound_at(host, port, networks)  # its error is raised
 
 
 def _bound_at(host: str, port: int, networks: Sequence[int]) -> dict[int, socket.socket]:
-    """The sockets of networks; with port 0 the first is bound to any free port, which says where the others are."""
+    """The bound socket of each network; with port 0 the first takes any free port, which determines the other ports."""
     with contextlib.ExitStack() as opened:
         sockets: dict[int, socket.socket] = {}
         for network in networks:
@@ -209,9 +209,9 @@ def drive(
 ) -> None:
     """Run the station in real time until its flight has ended.
 
-    `stop_reason` is called at every tick; a text other than "" ends the flight for that reason. `new_plan` is called
-    when identification has changed the flight plan. A mirror gets every frame received and sent, and may pass frames on
-    to the vehicles.
+    `stop_reason` is called at every tick; any text except "" ends the flight for that reason. `new_plan` is called when
+    identification has changed the flight plan. A mirror gets every frame received and sent, and may pass frames on to
+    the vehicles.
     """
     plan = station.plan
     log = Frames()
@@ -224,13 +224,13 @@ def drive(
             writer.event(Event(time_s=station.scenario_time_s(now_ns), kind=REFUSED, text=text, counts=counts))
 
     while station.phase is not Phase.ENDED:
-        # What came since the last tick is read before the next one is due, so that set-points do not wait for it.
+        # Datagrams are read shortly before the next tick is due: set-points then do not wait for that work.
         read_ns = station.next_tick_ns - _BEFORE_TICK_NS
         link.wait(min(station.next_event_ns, read_ns if clock_ns() < read_ns else station.next_tick_ns))
         now_ns = clock_ns()
         requests = Outbox()
         if station.next_event_ns <= now_ns < station.next_tick_ns:
-            requests = station.step([], now_ns)[0]  # before anything is read, so that they are sent in time
+            requests = station.step([], now_ns)[0]  # before the sockets are read, to send them in time
             log.add(sent := link.send(requests))
             station.sent(requests, sent.table[3])
         datagrams = link.receive(station.counters, station.is_another)

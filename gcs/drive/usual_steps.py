@@ -1,7 +1,7 @@
-"""Steps of plain vehicles and their station in virtual time that kernels do alone, many in one call.
+"""Usual steps: those of plain vehicles and their station in virtual time that kernels do alone, many in one call.
 
-In most flights these are nearly all steps. Where the kernel stops, as when a vehicle answers a command or its mode
-changes, a step in Python goes on from there (`gcs.drive.lockstep`).
+In most flights nearly all steps are usual. Where the kernel stops, for example when a vehicle answers a command or
+changes its mode, a step in Python continues from there (`gcs.drive.lockstep`).
 """
 
 from collections.abc import Generator, Sequence
@@ -26,56 +26,56 @@ if TYPE_CHECKING:
     from scenarios.handle import Handle
 
 NOT_LEFT, PAUSED = -1, -2
-"""How far steps came, beside what `usual_step` returns: not all that leaves the vehicles' links has left; all is done,
-but Python has to take what there is of rows and datagrams."""
+"""Progress of a call, in addition to the codes of `usual_step`. NOT_LEFT: Python must finish the vehicles' part of the
+step. PAUSED: the steps are complete, but Python must take the rows and datagrams."""
 _STEPS = 4
-"""Steps whose datagrams there is room for."""
+"""Number of steps whose datagrams the buffers hold."""
 _FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 32, 1024
-"""Ticks that are flown in one call if nobody needs to see them one by one: at first, as there may soon be something for
-Python to do, and at most later; and the most rows of these."""
+"""Ticks flown in one call when nothing needs them one at a time: initially few, because Python is soon needed again,
+doubling up to the maximum; and the maximum number of rows."""
 _WIRE = np.dtype(
     [
-        ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams that have not been passed on
-        ("in_step", "i8"), ("taken", "i8"),  # those of the last step, and how many of these the station has taken in
+        ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams not yet passed on to Python
+        ("in_step", "i8"), ("taken", "i8"),  # arrivals of the last step, and how many of them the station took in
         ("sent", "i8"), ("sent_bytes", "i8"),  # datagrams that enter the links in the next step
-        ("entered", "i8"), ("waiting", "i8"), ("leaving", "i8"),  # what `step_all` returned
-        ("now_ns", "i8"), ("next_ns", "i8"),  # of the last step, and when the next is due
-        ("ticks", "i8"),  # those done in this call
+        ("entered", "i8"), ("waiting", "i8"), ("leaving", "i8"),  # the results of `step_all`
+        ("now_ns", "i8"), ("next_ns", "i8"),  # time of the last step, and when the next is due
+        ("ticks", "i8"),  # ticks done in this call
     ]
 )  # fmt: skip
 
 
 class Wire(NamedTuple):
-    """What passes between both ends of the links, and what Python learns of a step."""
+    """Buffers shared by both ends of the links."""
 
     state: Records
-    """Of _WIRE, (1,)."""
+    """The state of the buffers and of the last step: one record of _WIRE."""
     arrived: Bytes
     arrivals: Ints
-    """The table of what has arrived, see `Datagrams`."""
+    """The table of the arrived datagrams, see `Datagrams`."""
     sent: Bytes
     to: Ints
-    """The table of what is sent."""
+    """The table of the sent datagrams."""
     due: Records
-    """Of DUE: what is known of the next ticks."""
+    """Records of DUE for the next ticks."""
     rows: Records
-    """Those of the ticks done, in order."""
+    """The rows of the ticks done in this call, in order."""
 
 
 class Ends(NamedTuple):
-    """All that a step works on."""
+    """The arrays that a step works on: both ends of the links, and the buffers between them."""
 
     fleet: FleetArrays
     usual: Usual
     places: Ints
-    """The vehicles' rows in the fleet, by their rows in the station."""
+    """The row in the fleet of each of the station's vehicles."""
     senders: Ints
-    """What `Reception.numbered` returns of the fleet's vehicles."""
+    """The result of `Reception.numbered` for the fleet's vehicles."""
     wire: Wire
 
 
 class Stopped(NamedTuple):
-    """A step that is not usual: when, the datagrams that arrived, and how many of these are taken in."""
+    """A step that Python must finish: its time, the datagrams that arrived, and how many of these are taken in."""
 
     now_ns: int
     arrived: Datagrams | list[Datagram]
@@ -83,9 +83,9 @@ class Stopped(NamedTuple):
 
 
 class UsualSteps:
-    """The usual steps of a station and a fleet. `addresses` are those of the fleet's vehicles, `places` see `Ends`.
+    """Flies the usual steps of a station and a fleet, whose vehicles have these `addresses`. For `places` see `Ends`.
 
-    With `ahead`, several ticks are flown before their rows are passed on, and received frames are not.
+    With `ahead`, several ticks are flown before their rows are yielded, and received frames are not passed on.
     """
 
     def __init__(
@@ -107,11 +107,11 @@ class UsualSteps:
         self._handle: Handle | None = None
 
     def fly(self, entering: Datagrams) -> Generator[TickArray, None, Stopped]:
-        """Do steps until one is not usual, which is returned; yields the rows of the control ticks.
+        """Do steps and yield the rows of their control ticks; returns the first step that is not usual.
 
-        `entering` is what the station has sent.
+        `entering` holds the datagrams that the station has sent.
         """
-        from scenarios.handle import handle  # with Numba, which most commands need not load
+        from scenarios.handle import handle  # imports Numba, which most commands do not need
 
         station, wire, state = self._station, self._wire, self._state
         now_ns = station.next_event_ns
@@ -141,7 +141,7 @@ class UsualSteps:
                 station.frames.clear()
 
     def _pass_on(self, count: int) -> None:
-        """Pass so many datagrams that have arrived, the first ones, on to the station's frames."""
+        """Add the first `count` arrived datagrams to the station's frames, and empty the buffer of arrivals."""
         if count:
             self._station.frames.add(Arrivals(*self._arrived(0, count), self._none_queued, self._addresses))
         self._state["arrived"][0] = self._state["arrived_bytes"][0] = 0
@@ -165,16 +165,16 @@ class UsualSteps:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether tuples of arrays, or of such tuples, hold the same ones."""
+    """Whether two nested tuples hold the same array objects."""
     return one is other or (isinstance(one, tuple) and all(map(_same, one, other)))
 
 
 @array_kernel
 def _fly(ends: Any, known: int, room: int, ahead: bool) -> int:
-    """Do steps as far as they are usual, up to the last of the `known` ticks; returns how far they came.
+    """Do steps while they are usual, up to the last of the `known` ticks; returns the code of the progress made.
 
-    `ends` is a handle on `Ends`. There is room for the datagrams of a further step while no more than `room` have
-    arrived; with `ahead` nobody wants those of earlier steps.
+    `ends` is a handle on `Ends`. While at most `room` datagrams have arrived, those of one more step fit into the
+    buffer; with `ahead`, those of earlier steps are discarded.
     """
     wire = ends.arrays[-1]
     state = wire.state[0]
@@ -196,7 +196,7 @@ def _fly(ends: Any, known: int, room: int, ahead: bool) -> int:
 
 @array_kernel
 def _step(ends: Any, known: int) -> int:
-    """One step, as far as it is usual; returns how far it came."""
+    """Do one step as far as it is usual; returns the code of the progress made."""
     fleet, usual, places, senders, wire = ends.arrays
     state, n = wire.state[0], len(places)
     now_ns, ticks = state.now_ns, state.ticks
@@ -225,7 +225,7 @@ def _step(ends: Any, known: int) -> int:
 
 @array_kernel
 def _arrive(wire: Wire, leaving: Ints, data: Bytes, count: int) -> Ints:
-    """Let so many datagrams arrive that leave the links, in order of time and row; returns their table."""
+    """Add `count` datagrams that leave the links to the arrivals, in order of time and row; returns their table."""
     state, order = wire.state[0], np.argsort(leaving[3, :count], kind="mergesort")
     before, size = state.arrived_bytes, leaving[1, count - 1] if count else 0
     copy_bytes(wire.arrived, before, data, 0, size)
@@ -240,7 +240,7 @@ def _arrive(wire: Wire, leaving: Ints, data: Bytes, count: int) -> Ints:
 
 @kernel
 def _send(wire: Wire, sending: Sending, places: Ints, now_ns: int) -> None:
-    """Add frames to those that enter the links in the next step."""
+    """Add frames to the datagrams that enter the links in the next step."""
     state = wire.state[0]
     for k in range(len(sending.rows)):
         begin, place, width = state.sent_bytes, state.sent, sending.frames.shape[1]

@@ -1,6 +1,6 @@
-"""The one reader of each file in a run's folder.
+"""Reads and writes the files of a run's folder; each file has its only reader here.
 
-A file that is damaged, or of another kind, raises gcs.errors.InputError with one line.
+A damaged file, or one of another kind, raises gcs.errors.InputError with a one-line message.
 """
 
 from collections import defaultdict
@@ -30,19 +30,19 @@ Rows = NDArray[np.void]
 
 
 def read_scenario(folder: Path) -> Scenario:
-    """The scenario of a run as flown. Raises InputError if there is none, ScenarioError if the file is damaged."""
+    """The scenario of a run as flown. Raises InputError if it is missing, ScenarioError if the file is damaged."""
     if not (folder / SCENARIO_FILE).exists():
         raise InputError(f"{folder}: read no {SCENARIO_FILE}, wanted the folder of a run")
     return scenario_files.load(folder / SCENARIO_FILE)
 
 
 def read_design(file: Path) -> Design:
-    """A design.json, of which only the margins have to be there."""
+    """The design in a design.json; only its delay margin is required."""
     return _checked(file, Design, f"the {DESIGN_FILE} of a run")
 
 
 def write_design(folder: Path, design: Design) -> None:
-    """Write a run's design.json, whole or not at all."""
+    """Write a run's design.json atomically."""
     write_whole(folder / DESIGN_FILE, design.to_json().encode())
 
 
@@ -68,7 +68,7 @@ def read_ticks(folder: Path) -> TickArray:
 
 
 _ADDED = {"delay_margin_s": np.nan, "loop_delay_bound_s": np.nan, "repeated_s": 0.0, "assumed_delay_s": 0.0}
-"""Columns that older runs lack, and the values read instead."""
+"""Columns that older runs lack, and the value that stands in for each."""
 
 
 def _from_parquet(file: Path) -> TickArray:
@@ -76,7 +76,7 @@ def _from_parquet(file: Path) -> TickArray:
     import pyarrow.parquet as pq
 
     def values(column: Any) -> Any:
-        # column.to_numpy(), as pq.read_table, would import pandas where that is installed: a fifth of a second
+        # column.to_numpy() and pq.read_table would import pandas if that is installed, which takes a fifth of a second
         column = column.cast(pa.uint8()) if column.type == pa.bool_() else column
         return np.from_dlpack(column.combine_chunks())
 
@@ -101,7 +101,7 @@ def _checked(file: Path, kind: type[_Record], wanted: str) -> _Record:
 
 
 def _first(errors: ValidationError) -> str:
-    """The first of pydantic's findings: key, what was read, what should be there."""
+    """The first of pydantic's errors as text: the key, what was read, what should be there."""
     first = errors.errors()[0]
     key = ".".join(map(str, first["loc"]))
     if first["type"] in ("json_invalid", "missing"):
@@ -114,7 +114,7 @@ def _first(errors: ValidationError) -> str:
 def by_tick(rows: TickArray, system_ids: Sequence[int]) -> TickArray:
     """Rows of a run as whole ticks: shape (ticks, vehicles), the vehicles in the order of `system_ids`.
 
-    A last tick of which rows are missing, as a killed station may leave it, is left out.
+    An incomplete last tick, as a killed station may leave it, is dropped.
     """
     count = len(system_ids)
     ticks = rows[: rows.size // count * count].reshape(-1, count)
@@ -123,7 +123,7 @@ def by_tick(rows: TickArray, system_ids: Sequence[int]) -> TickArray:
 
 
 def by_vehicle(rows: Rows) -> defaultdict[int, Rows]:
-    """The rows of each vehicle by its system id, in the order that they have; none for other ids."""
+    """Rows grouped by system id, in their original order; any other id gives an empty array."""
     order = rows["system_id"].argsort(kind="stable")
     system_ids, first = np.unique(rows["system_id"][order], return_index=True)
     found = zip(system_ids.tolist(), np.split(chosen(rows, order), first[1:]), strict=False)
@@ -131,9 +131,9 @@ def by_vehicle(rows: Rows) -> defaultdict[int, Rows]:
 
 
 class RunTail:
-    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing.
+    """Reads the ticks and events added to a run since the last call; the run may still be growing.
 
-    `vehicles` are the rows of a tick; 1 also gives single rows of a tick that was not written whole.
+    `vehicles` is the number of rows of a tick. With 1, single rows of an incomplete tick are returned, too.
     """
 
     def __init__(self, folder: Path, vehicles: int = 1) -> None:
@@ -143,13 +143,13 @@ class RunTail:
         self._events_read = 0
 
     def ticks(self) -> TickArray:
-        """New rows, in the order they were written; a half-written tick is left for the next call."""
+        """New rows, in the order in which they were written; an incomplete tick is left for the next call."""
         data, count = self._new(TICKS_FILE, self._ticks_read, self._tick_bytes)
         self._ticks_read += count
         return np.frombuffer(data[:count], dtype=TICK)
 
     def events(self) -> list[Event]:
-        """New events, in the order they were written."""
+        """New events, in the order in which they were written."""
         data, _ = self._new(EVENTS_FILE, self._events_read, 1)
         whole = data[: data.rfind(b"\n") + 1]
         self._events_read += len(whole)

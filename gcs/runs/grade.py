@@ -1,8 +1,8 @@
-"""Measured latencies against the truth that vehicles and emulated links recorded, for `gcs grade`.
+"""Grades measured latencies against the truth recorded by vehicles and emulated links, for `gcs grade`.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
-loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
-acts; both are found in the truth by the time_boot_ms of the messages.
+loop delay, repetition included, runs from when the state was sampled until the set-point computed from it acts; the
+truth has both times by the time_boot_ms of the messages.
 """
 
 import itertools
@@ -21,13 +21,13 @@ from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
 Truth = NDArray[np.void]
-"""Records as sim_vehicles.links.truth.DTYPE lays them out."""
+"""Records of dtype sim_vehicles.links.truth.DTYPE."""
 
 _TIMESYNC, _NEVER = 111, -1
 
 
 class Graded(Published):
-    """The errors of measurements against the truth; None without a sample."""
+    """Percentiles of the absolute error of measurements against the truth; None without a sample."""
 
     status: str
     samples: int
@@ -37,7 +37,7 @@ class Graded(Published):
 
 
 class Grade(Published):
-    """The errors of a run's loop delays and round trips, and how punctual its emulated links were."""
+    """The errors of a run's loop delays and round trips, and the lateness of its emulated links."""
 
     vehicles: int
     loop_delay: Graded
@@ -46,7 +46,7 @@ class Grade(Published):
 
 
 def grade(folder: Path) -> Grade:
-    """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
+    """Grade a run: the loop delays and round trips that it measured, and the lateness of its emulated up links.
 
     Raises InputError if the folder is not a run, or has no truth log.
     """
@@ -77,10 +77,10 @@ def grade(folder: Path) -> Grade:
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
-    """The error of each measured round trip against the nearest true one whose reply had left before its tick.
+    """The error of each measured round trip against the nearest true one whose reply was due before its tick.
 
-    Both are in order of time and each reply counts once: of several replies between two ticks, later ticks log the
-    later ones.
+    Both lists are in order of time and each reply is matched once: of several replies between two ticks, the later ones
+    are logged by later ticks.
     """
     rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
     due_ns, trip_s = true_round_trips(truth, system_id)
@@ -97,11 +97,11 @@ def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray
 
 
 def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], FloatArray]:
-    """TIMESYNC requests that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
+    """TIMESYNC exchanges that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
     own = truth[(truth["system_id"] == system_id) & (truth["key"] == _TIMESYNC) & (truth["fate"] & DROPPED == 0)]
     asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
-    # Without reordering, several may arrive at one instant, and are answered in their order. If one of them is not a
-    # request but the station's answer to the vehicle, it is not known which, and none of them counts.
+    # On a link that does not reorder, several requests may arrive at one instant; they are answered in order. If one of
+    # them is the station's answer to the vehicle instead, it cannot be told which, and none of them counts.
     sent_ns: dict[int, list[int]] = defaultdict(list)
     left_ns: dict[int, list[int]] = defaultdict(list)
     for entered_ns, due_ns in sorted(asked[["entered_ns", "due_ns"]].tolist()):
@@ -120,9 +120,7 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
     """The true age (s) of the state behind each row's set-point when the set-point acted.
 
-    NaN where it never acted, or no state is known.
-
-    `ticks` are whole: a row for every vehicle.
+    NaN where the set-point never acted, or its state is unknown. `ticks` must be whole, with a row for every vehicle.
     """
     sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
     states = ticks[["system_id", "sample_boot_ms"]][_rows_used(ticks)].tolist()
@@ -135,29 +133,30 @@ def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
 
 
 def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
-    """For each row, the row of the same tick whose state its loop delay counts from.
+    """For each row, the row of the same tick with the state from which its loop delay is counted.
 
-    In the ground loop its own; in the onboard loop that of the oldest state that was needed, known by its age.
+    With the loop on the ground that is the row itself; with loops on board it is the row of the oldest state needed,
+    identified by its age.
     """
     vehicles = len(np.unique(ticks["system_id"]))
     age_s = ticks["telemetry_age_s"].reshape(-1, vehicles)
     used_s = (ticks["loop_delay_s"] + ticks["repeated_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
     own, nearest = np.arange(vehicles), np.empty(age_s.shape, np.int64)
-    for k in range(len(age_s)):  # tick by tick: all together would take 8 GB for 20 s of 1,000 vehicles
+    for k in range(len(age_s)):  # tick by tick: all at once would take 8 GB for 20 s of 1,000 vehicles
         apart_s = np.abs(age_s[k] - used_s[k, :, np.newaxis])
-        apart_s[own, own] -= 1e-9  # prefer its own, where another one is as old
+        apart_s[own, own] -= 1e-9  # of equally old states, prefer the vehicle's own
         nearest[k] = np.argmin(np.where(np.isnan(apart_s), np.inf, apart_s), axis=1)
     return (np.arange(len(age_s))[:, np.newaxis] * vehicles + nearest).ravel()
 
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
-    """The first instant (ns) of each (system id, time_boot_ms)."""
-    own = truth[truth["kind"] == kind][::-1]  # reversed, so that the first of several records is kept
+    """The first instant (ns) recorded for each (system id, time_boot_ms) in the records of a kind."""
+    own = truth[truth["kind"] == kind][::-1]  # reversed: the first of several records is then kept
     return {(system_id, key): time_ns for system_id, key, time_ns in own[["system_id", "key", "time_ns"]].tolist()}
 
 
 def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
-    """The errors of measurements where both they and the truth are known."""
+    """The errors of those measurements for which the truth is known."""
     both = np.isfinite(measured_s) & np.isfinite(true_s)
     error_s = np.abs(measured_s - true_s)[both]
     if not error_s.size:
@@ -168,7 +167,7 @@ def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
 
 
 def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
-    """(k, 2) instants in ns at which a vehicle's commands acted and at which the states used were sampled, in order."""
+    """When a vehicle's commands acted and when the states behind them were sampled: (k, 2), ns, in order of time."""
     own, of_truth = (ticks["system_id"] == system_id) & ticks["commanded"], truth["system_id"] == system_id
     acted_ns, sampled_ns = (
         _first_ns(truth, of_truth & (truth["kind"] == kind), ticks[name][own])
@@ -180,7 +179,7 @@ def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.in
 
 
 def _first_ns(truth: Truth, which: NDArray[np.bool_], keys: IntArray) -> IntArray:
-    """The instant (ns) of the first of some records with each of these keys; _NEVER where there is none."""
+    """For each key, the instant (ns) of the first record in `which` that has it; _NEVER where there is none."""
     known, first = np.unique(truth["key"][which], return_index=True)
     found_ns = np.append(truth["time_ns"][which][first], _NEVER)
     place = np.searchsorted(known, keys)
@@ -188,9 +187,9 @@ def _first_ns(truth: Truth, which: NDArray[np.bool_], keys: IntArray) -> IntArra
 
 
 def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
-    """As `commands_of`, with loops on board: the states are the oldest that each streamed command needed.
+    """`commands_of` for loops on board: the states are the oldest that each streamed command needed.
 
-    `ticks` are whole: a row for every vehicle.
+    `ticks` must be whole, with a row for every vehicle.
     """
     acted, delays_s = instants(truth, ACTED), true_loop_delays_s(ticks, truth)
     own = (ticks["system_id"] == system_id) & np.isfinite(delays_s)

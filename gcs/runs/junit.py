@@ -1,4 +1,4 @@
-"""What a command checked, as JUnit XML for CI."""
+"""Writes the checks of a command as JUnit XML for CI."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from xml.etree import ElementTree
 
 @dataclass(frozen=True)
 class Check:
-    """One test case. It has passed unless one of the texts says why not."""
+    """One test case. It has passed if all three texts are empty."""
 
     name: str
     failure: str = ""
     skipped: str = ""
     error: str = ""
-    """The traceback, if the check could not be made."""
+    """The traceback, if the check itself failed to run."""
 
 
 def write_junit(file: Path, suite_name: str, checks: Sequence[Check], *, time_s: float) -> None:

@@ -1,8 +1,8 @@
-"""What a run leaves behind while it flies: the tick record, the events, the telemetry log.
+"""Writes the logs of a run in flight: the tick record, the events, the telemetry log.
 
-All three are append-only files, written with one system call a tick: a killed process loses nothing that it had logged.
-The live table and the Rerun recording follow the flight by reading these files, so the control loop never waits for
-them.
+All three are append-only files, each written with one system call per tick, so a killed process loses nothing that it
+had logged. The live table and the Rerun recording follow the flight by reading these files, so the control loop never
+waits for them.
 """
 
 import contextlib
@@ -25,46 +25,46 @@ from scenarios.sockets import Ints
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
 TICKS_FILE = "ticks.part"
-"""The growing tick log; it becomes PARQUET_FILE when the run is finished."""
+"""The tick log while it grows; it becomes PARQUET_FILE when the run is finished."""
 PARQUET_FILE = "ticks.parquet"
 EVENTS_FILE = "events.jsonl"
 TLOG_FILE = "flight.tlog"
 """The telemetry log of network 0, see `tlog_file`."""
 TRUTH_FILE = "truth.bin"
-"""When the simulated vehicles sampled their states and when set-points acted, as they know it."""
+"""The vehicles' own record of when they sampled their states and when set-points acted."""
 MIRROR = "mirror"
-"""Kind of the event that counts what a mirrored station sent."""
+"""Kind of the event that counts the frames exchanged with the other station of a mirror."""
 RECORDING_FILE = "flight.rrd"
 UNFINISHED_FILE = RECORDING_FILE + ".part"
 """The recording while it is written."""
 SUMMARY_FILE = "summary.json"
 NEW_DESIGN = "design"
-"""Kind of the event that DESIGN_FILE has been written anew."""
+"""Kind of the event that reports that DESIGN_FILE was rewritten."""
 END = "end"
 """Kind of the last event of a flight."""
 FLEET = "fleet"
-"""Kind of the event that says where the vehicles are from, if the flight did not start them."""
+"""Kind of the event that says where the vehicles come from, if the flight did not start them."""
 STARTED = "started by the station"
 """Origin of the vehicles in all other flights."""
 LOG_ENDED = "log"
-"""Kind of the event that a file can no longer be written: its name and the reason."""
+"""Kind of the event that names a file that can no longer be written, and the reason."""
 _MOST_WAITING = 1000
 _STAMP = struct.Struct(">Q")
 READY_FILE = ".observer-ready"
-"""Exists while an observer follows the run."""
+"""A file that exists while an observer follows the run."""
 
 
 def tlog_file(network: int | str) -> str:
-    """The name of a network's telemetry log: frames do not say which network they belong to."""
+    """The name of a network's telemetry log. Each network has its own, because frames do not name their network."""
     return TLOG_FILE if network == 0 else f"flight-{network}.tlog"
 
 
 class RunWriter:
     """Appends ticks, events and MAVLink frames to the files of one run folder.
 
-    Nothing here raises because a disk is full: the flight goes on without the log. A log of ticks or frames that could
-    not be written ends there, after its last whole record and without a gap; the event LOG_ENDED says so. Events are
-    few, and are kept until they can be written.
+    A full disk raises nothing: the flight continues without the log. If ticks or frames cannot be written, their log
+    ends there, after its last whole record and without a gap, and the event LOG_ENDED says so. Events are few; they are
+    kept in memory until they can be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -74,14 +74,14 @@ class RunWriter:
         self._waiting: list[Event] = []
         """Events that could not be written yet."""
         self._time_s = -np.inf
-        """Of the newest tick."""
+        """Scenario time of the newest tick."""
 
     def tick(self, rows: TickArray) -> None:
         self._time_s = float(rows["time_s"][0])
         self._add(TICKS_FILE, rows.tobytes())
 
     def event(self, *events: Event) -> None:
-        """Log events, and those before them that could not be written yet."""
+        """Log events, after the earlier ones that could not be written yet."""
         self._waiting += (replace(event, time_s=round(event.time_s, 6)) for event in events)
         lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
         try:
@@ -93,13 +93,13 @@ class RunWriter:
     def frames(self, frames: Frames, epoch_ns: int = 0) -> None:
         """Log frames in the .tlog layout: big-endian µs since 1970, then the frame.
 
-        `epoch_ns` is the instant, in ns since 1970, from which their times count.
+        `epoch_ns` is the zero of the frames' times, in ns since 1970.
         """
         for network, entries in tlog_entries(frames, epoch_ns).items():
             self._add(tlog_file(network), entries)
 
     def ended(self, name: str, error: OSError) -> None:
-        """Note that a file of the run could not be written; it is left as it is from now on."""
+        """Log that a file of the run could not be written, and write no more to it."""
         self._ended.add(name)
         self.event(Event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}"))
 
@@ -113,7 +113,7 @@ class RunWriter:
         if name in self._ended:
             return
         try:
-            if name not in self._logs:  # that of a network
+            if name not in self._logs:  # the first frames of another network
                 self._logs[name] = RecordLog(self._folder / name)
             self._logs[name].add(data)
         except OSError as error:
@@ -121,7 +121,7 @@ class RunWriter:
 
 
 def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
-    """The entries of frames in the telemetry log of each network."""
+    """The bytes to append to the telemetry log of each network."""
     entries: dict[int, list[bytes]] = defaultdict(list)
     for part in frames.parts:
         if isinstance(part, Arrivals):
@@ -137,7 +137,7 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
     numbers = arrivals.table[2].tolist()
-    # `addresses` may hold every sender heard so far, strangers too: look only at those of this table
+    # `addresses` may hold every sender heard so far, even strangers: look only at those in this table
     network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}
     networks = set(network_of.values())
     if len(networks) == 1:
@@ -148,7 +148,7 @@ def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
 
 @kernel
 def _fill(entries: Array, stream: Array, table: Array, epoch_ns: int) -> None:
-    """Fill an array of bytes with the entries of a telemetry log."""
+    """Fill the array `entries` with the telemetry log entries of the frames in a table."""
     at = 0
     for k in range(table.shape[1]):
         stamp_us = (epoch_ns + table[3, k]) // 1000
@@ -161,19 +161,19 @@ def _fill(entries: Array, stream: Array, table: Array, epoch_ns: int) -> None:
 
 
 def event_fields(event: Event) -> dict[str, Any]:
-    """The fields of a line of events.jsonl; `counts` only where the event has them."""
+    """The fields of a line of events.jsonl; `counts` is left out if it is None."""
     return {name: value for name, value in vars(event).items() if name != "counts" or value is not None}
 
 
 class RecordLog:
-    """A file that grows by whole records: a partly written one is cut off."""
+    """A file that grows by whole records: if writing one fails, the part written is truncated."""
 
     def __init__(self, file: Path) -> None:
         self.descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         self._size = os.fstat(self.descriptor).st_size
 
     def add(self, record: bytes) -> None:
-        """Append a record, or nothing; raises OSError."""
+        """Append a record; raises OSError, with the file as before, if it cannot be written whole."""
         try:
             left = record
             while left:
@@ -188,22 +188,22 @@ class RecordLog:
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Replace a file in one step: nobody reads half of it, and the old one stays if writing fails."""
+    """Replace a file atomically: no reader sees half of it, and the old file stays if writing fails."""
     with replacing(file) as part:
         part.write_bytes(data)
 
 
 def write_parquet(file: Path, columns: Mapping[str, Any]) -> None:
-    """Replace a Parquet file in one step. A column is a numpy array without gaps, or a list."""
+    """Replace a Parquet file atomically. A column is a contiguous numpy array or a list."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     def column(values: Any) -> Any:
         if not isinstance(values, np.ndarray):
             return pa.array(values)
-        # pa.array(values) would import pandas where that is installed, which takes a fifth of a second
+        # pa.array(values) would import pandas if that is installed, which takes a fifth of a second
         kind, data = pa.from_numpy_dtype(values.dtype), values
-        if values.dtype == bool:  # in Arrow a bit each
+        if values.dtype == bool:  # Arrow stores one bit for each
             data = np.packbits(values, bitorder="little")
         return pa.Array.from_buffers(kind, values.size, [None, pa.py_buffer(data)])
 
@@ -214,7 +214,7 @@ def write_parquet(file: Path, columns: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def replacing(file: Path) -> Generator[Path]:
-    """A new file to write inside the `with` block, which then replaces `file` in one step."""
+    """Yields a new file to write inside the `with` block; on exit it atomically replaces `file`."""
     part = file.with_name(file.name + ".new")
     try:
         yield part

@@ -1,4 +1,4 @@
-"""What the station refuses, by reason, for the log of a run: each reason once, so that no attacker can fill the log."""
+"""What the station and the vehicles refused, by reason. A reason is logged once, so no attacker can fill the log."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,12 +9,12 @@ from pydantic import TypeAdapter
 from gcs.control.tick import Event
 
 VEHICLES_FILE = "vehicles.json"
-"""The counters of the simulated vehicles."""
+"""The file with the counters of the simulated vehicles."""
 
 REFUSED = "refused"
-"""Kind of the events: one when a reason is first met, and one at the end with how often each was."""
+"""Kind of the events: one when a reason first occurs, and one at the end with the final count of each reason."""
 _IGNORED = {"other component", "before a first heartbeat"}
-"""Not refused, only of no use to the station."""
+"""Counters of frames that are harmless but of no use to the station, so not refusals."""
 _COUNTERS = TypeAdapter(dict[str, int])
 
 
@@ -25,7 +25,7 @@ class Refusals:
         self._told: dict[str, int] = {}
 
     def news(self, counters: Counter[str], *, last: bool = False) -> dict[str, int]:
-        """All counts by reason if there is a new reason, or at the end if any has changed; nothing otherwise."""
+        """All counts by reason if a reason is new, or with `last` if any count has changed; empty otherwise."""
         if not last and counters.keys() <= self._told.keys() | _IGNORED:
             return {}
         counts = {reason: count for reason, count in counters.items() if reason not in _IGNORED}
@@ -41,7 +41,7 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """The counters of a run's vehicles; None without their file."""
+    """The counters of a run's vehicles; None if their file is missing or damaged."""
     try:
         return _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
     except (OSError, ValueError):
@@ -49,7 +49,7 @@ def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
 
 
 def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What a run's vehicles refused, by reason; None if that is not known."""
+    """How often a run's vehicles refused something, by reason; None if unknown."""
     counters, prefix = counted_by_vehicles(folder), "refused_"
     if counters is None:
         return None
@@ -58,5 +58,5 @@ def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
 
 
 def counts_of(events: Sequence[Event], kind: str) -> dict[str, int]:
-    """The newest counts in the events of a kind."""
+    """The counts of the last event of a kind that has any; empty if none has."""
     return next((event.counts for event in reversed(events) if event.kind == kind and event.counts is not None), {})

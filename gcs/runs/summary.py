@@ -1,6 +1,6 @@
-"""From a run's logs to its verdict: ticks.parquet and summary.json.
+"""Turns a run's logs into its verdict: writes ticks.parquet and summary.json.
 
-Works from the files alone, so a run whose station was killed is finished by the same code as one that ended well.
+It works from the files alone, so the same code finishes a run whose station was killed and one that ended well.
 """
 
 from collections import defaultdict
@@ -40,22 +40,22 @@ from gcs.runs.summary_record import (
 from scenarios.schema import NS_PER_S, Scenario
 
 _SKEW_SPAN_S = 1.0
-"""A clock's skew is not estimated over a shorter time than this."""
+"""Shortest time over which a clock's skew is estimated."""
 _SETTLED_SHARE = 0.05
-"""Vehicles must stay settled for this share of the flight, its last."""
+"""Vehicles must stay settled over this last share of the flight."""
 _DECAYS = 7.0
-"""The initial errors are gone after this many time constants of the slowest motion: e^-7 of them are left."""
+"""The initial errors count as gone after this many time constants of the slowest decay: e^-7 of them are left."""
 Errors = tuple[FloatArray, FloatArray]
-"""Times (s) and the norm of an error of one vehicle: of spacing (m) or of velocity (m/s)."""
+"""Times (s) and the norm of one vehicle's error at each: spacing (m) or velocity (m/s)."""
 SILENT_END = "interrupted: the station ended without recording why"
 
 
 def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary:
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
 
-    `unwritten` is given only at the end of a flight: the events that could not be written. The summary then names in
-    `not_logged` whatever cannot be written now, and the log of ticks is kept. Raises InputError if the folder is
-    not a run, or a file of it is damaged, and OSError if a file cannot be written, unless `unwritten` is given.
+    `unwritten`, given only at the end of a flight, holds the events that could not be written. Files that cannot be
+    written now are then named in `not_logged`, and without a Parquet file the tick log is kept. Raises InputError if
+    the folder is not a run or has a damaged file, and OSError if a file cannot be written but `unwritten` is None.
     """
     scenario = read_scenario(folder)
     design = read_design(folder / record.DESIGN_FILE)
@@ -67,7 +67,7 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     not_logged = list(summary.not_logged)
     if unwritten:
         not_logged.append(f"{record.EVENTS_FILE}: the last {len(unwritten)}")
-    recorded = (folder / record.RECORDING_FILE).exists() or find_spec("rerun") is None  # without it none is written
+    recorded = (folder / record.RECORDING_FILE).exists() or find_spec("rerun") is None  # without Rerun none is expected
     if unwritten is not None and not recorded:
         not_logged.append(f"{record.RECORDING_FILE}: see gcs recover")
     if lost := (counted_by_vehicles(folder) or {}).get("truth_lost"):
@@ -88,7 +88,7 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     def there() -> set[str]:
         return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
 
-    def columns() -> None:  # the log of ticks is deleted only once the Parquet file is complete
+    def columns() -> None:  # deletes the tick log only once the Parquet file is complete
         names = TICK.names or ()
         record.write_parquet(folder / record.PARQUET_FILE, {name: np.ascontiguousarray(ticks[name]) for name in names})
         (folder / record.TICKS_FILE).unlink(missing_ok=True)
@@ -101,9 +101,9 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """The verdict on a flight and what it rests on.
+    """The verdict on a flight and the evidence for it.
 
-    `flown` holds the rows of the flight; `flown_of` these rows, and `errors` the spacing errors, by system id.
+    `flown` holds the rows of the flight. `flown_of` holds these rows, and `errors` the spacing errors, by system id.
     """
 
     verdict: str
@@ -122,7 +122,7 @@ class Judgement:
 
 
 def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judgement:
-    """Judge a flight by its ticks and events; see `verdict`."""
+    """Judge a flight by its ticks and events, as described in `verdict`."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = chosen(ticks, (ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1)))
     reason = ([event.text for event in events if event.kind == record.END] or [SILENT_END])[-1]
@@ -144,7 +144,7 @@ def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judg
 
 
 def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
-    """The summary of a run, all but its files and what its vehicles refused."""
+    """The summary of a run, without its files and its vehicles' refusals."""
     judged, ticks_of = judge(scenario, ticks, events), by_vehicle(ticks)
     flown = judged.flown
     sent = chosen(flown, flown["commanded"])
@@ -153,7 +153,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
-    slowest = max(delays_s, key=delays_s.__getitem__, default=0)  # its gains, as its delay, count for alpha
+    slowest = max(delays_s, key=delays_s.__getitem__, default=0)  # alpha is computed for its delay and its gains
     longest_flown = int(np.bincount(sent["gain_set"][sent["system_id"] == slowest], minlength=1).argmax())
     return Summary(
         scenario=scenario.name,
@@ -220,16 +220,16 @@ def verdict(
 
 
 def _error(rows: TickArray, column: str) -> Errors:
-    """The norm over north and east of an error of a vehicle, where it is known."""
+    """The norm over north and east of one vehicle's error, where it is known."""
     error = np.hypot(rows[column.format("north")], rows[column.format("east")])
     known = np.isfinite(error)
     return rows["time_s"][known], error[known]
 
 
 def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Mapping[int, TickArray]) -> float | None:
-    """When the last follower came within a fraction of its spacing for good; None if one has not.
+    """The time from which every follower's error stays within a fraction of its spacing; None if one does not.
 
-    It must stay there for the last `_SETTLED_SHARE` of the flight: errors that swing or grow come near zero, too.
+    It must stay there for the last `_SETTLED_SHARE` of the flight: errors that oscillate or grow come near zero, too.
     A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
     """
     whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
@@ -251,19 +251,19 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown_of: Ma
 def _vehicle(
     rows: TickArray, own: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float], completed: bool
 ) -> VehicleSummary:
-    """The figures of a vehicle from all its rows, and its own of the flight.
+    """The figures of a vehicle, from all its `rows` and from those of the flight, `own`.
 
-    What becomes of it after a flight that was not `completed` counts for its mode.
+    Rows after the flight count for the final mode only if the flight was not `completed`.
     """
     sent = chosen(own, own["commanded"])
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
     margins_s, rtt = sent["delay_margin_s"], estimate(rows["rtt_s"])
-    with np.errstate(invalid="ignore"):  # a margin of 0, at which the headroom is minus infinity
-        # what is left of the margin; with prediction of the distance to the window's end
+    with np.errstate(invalid="ignore"):  # at a margin of 0 the headroom is minus infinity
+        # the unused part of the margin; with prediction, of the distance to the window's end
         headroom_s = sent["headroom"] * (margins_s - sent["assumed_delay_s"])
     modes = (own if completed else rows)["mode"]
-    if (modes != Mode.WAITING).any():  # every vehicle is WAITING again once it is told to hold at the end
+    if (modes != Mode.WAITING).any():  # every vehicle returns to WAITING once it is told to hold at the end
         modes = modes[modes != Mode.WAITING]
     return VehicleSummary(
         system_id=system_id,
@@ -285,7 +285,7 @@ def _vehicle(
 
 
 def estimate(values: FloatArray) -> Estimate:
-    """The spread of an estimate with its status and the number of its samples."""
+    """The spread of samples, their number, and whether there are any."""
     samples = int(np.isfinite(values).sum())
     return Estimate(**vars(_spread(values)), samples=samples, status="measured" if samples else "unknown")
 
@@ -296,9 +296,9 @@ def _one_way(delay_s: FloatArray, bound_s: FloatArray) -> OneWayDelay:
 
 
 def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
-    """The clock's offset as last estimated, its skew since the last jump, and their bounds.
+    """The last estimate of a clock's offset, its skew since the last jump, and the bounds of both.
 
-    The skew is the slope between the first and the last offset, each of which is wrong by its bound at most.
+    The skew is the slope between the first and the last offset; each is wrong by at most its own bound.
     """
     known = chosen(own, np.isfinite(own["clock_offset_s"]))
     if not known.size:
@@ -324,9 +324,9 @@ def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
 def _flown_spread(
     scenario: Scenario, design: Design, flown: TickArray, delays_s: dict[int, float]
 ) -> FlownSpread | None:
-    """The rms of each follower's reported spacing error, from when its start and the last turn are forgotten.
+    """The rms of each follower's reported spacing error after the transients of the start and the last turn.
 
-    None if nothing disturbs the vehicles, nothing can be computed, or the flight ended before that.
+    None if nothing disturbs the vehicles, no prediction can be computed, or the flight ended during the transient.
     """
     if (scenario.disturbance is None and scenario.navigation is None) or not delays_s:
         return None
@@ -357,9 +357,9 @@ def _flown_spread(
 
 
 def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> FloatArray:
-    """(2, n, n): how much of the report before the newest is in what vehicle i sees of vehicle k; see `history.at`.
+    """(2, n, n): weight w of the report before the newest in k's position and velocity at i's newest state.
 
-    Averaged over the ticks so that the variance w^2 + (1 - w)^2 of white noise is kept: shares change as clocks drift.
+    See `history.state_at`. w varies as clocks drift; its mean here keeps the variance w^2 + (1 - w)^2 of white noise.
     """
     period_ns = NS_PER_S / scenario.rates.telemetry_hz
     ticks, at = np.unique(flown["tick"], return_inverse=True)
@@ -370,7 +370,7 @@ def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> F
     shares = np.zeros((2, len(ids), len(ids)))
     for row in range(len(ids)):
         newer = (sample_ns - sample_ns[:, [row]]) / period_ns
-        x = np.where(newer > 0.0, newer % 1.0, 0.0)  # how far back from the newer of the two reports
+        x = np.where(newer > 0.0, newer % 1.0, 0.0)  # time back from the newer of the two reports, in periods
         known = np.maximum(np.isfinite(newer).sum(axis=0), 1)
         for share, of_older in zip(shares, (x * x * (3.0 - 2.0 * x), x), strict=True):
             both = (of_older * (1.0 - of_older)).sum(axis=0) / known
@@ -379,7 +379,7 @@ def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> F
 
 
 def control_of(scenario: Scenario, flown: TickArray) -> Control:
-    """Ticks flown, and deadline misses: the last set-point sent over half a period after it was due, or none at all."""
+    """Ticks flown and deadline misses: ticks skipped, or whose last set-point was sent over half a period late."""
     ticks, first = np.unique(flown["tick"], return_index=True)
     last_ns = np.maximum.reduceat(flown["sent_ns"], first) if first.size else flown["sent_ns"]
     late_s = (last_ns - flown["due_ns"][first]) * 1e-9

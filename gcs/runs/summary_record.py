@@ -1,6 +1,6 @@
-"""The summary of a run: a frozen record with the fields of summary.json.
+"""The summary of a run: frozen records with the fields of summary.json.
 
-`gcs.runs.summary` makes it from the logs of a run, `gcs.runs.files` reads it back.
+`gcs.runs.summary` makes them from the logs of a run; `gcs.runs.files` reads them back.
 """
 
 from math import isfinite
@@ -15,18 +15,18 @@ from gcs.runs.record import STARTED, event_fields
 
 
 def rounded(value: Any) -> Any:
-    """A float to nine decimals; None for one that is not finite: JSON has no infinity."""
+    """Round a float to nine decimals; None if it is not finite, because JSON has no infinity or NaN."""
     if not isinstance(value, float):
         return value
     return round(float(value), 9) if isfinite(value) else None
 
 
 Number = Annotated[float | None, BeforeValidator(rounded)]
-"""None where it is unknown or without bound."""
+"""A number; None where it is unknown or unbounded."""
 
 
 class Spread(Published):
-    """Percentiles and maximum of a quantity, None without a sample."""
+    """Percentiles and maximum of a quantity; None without a sample."""
 
     p50: Number
     p95: Number = None
@@ -42,7 +42,7 @@ class Estimate(Spread):
 
 
 class OneWayDelay(Estimate):
-    """The spread of a one-way delay, and the largest error that the vehicle's clock brings into it."""
+    """The spread of a one-way delay, and the largest error that the vehicle's clock can cause in it."""
 
     bound_s: Number
 
@@ -108,7 +108,7 @@ class VehicleFlownSpread(Published):
 
 
 class FlownSpread(Published):
-    """How far disturbances and errors of navigation spread the spacing errors, flown and predicted."""
+    """How far disturbances and navigation errors spread the spacing errors, as flown and as predicted."""
 
     loop_delay_s: Number
     from_s: Number
@@ -121,12 +121,12 @@ class LawRecord(Published):
     calls: int
     unusable: int
     over_budget: int | None
-    """None in virtual time, in which calls are not timed."""
+    """None in virtual time, where calls are not timed."""
     budget_s: float
 
 
 class Summary(Published):
-    """The verdict on a run and its figures. What older files lack keeps its default.
+    """The verdict on a run and its figures. Fields that an older file lacks keep their default.
 
     docs/reference describes each field.
     """
@@ -152,7 +152,7 @@ class Summary(Published):
     duration_s: Number = None
     vehicles: tuple[VehicleSummary, ...] = ()
     control: Control | None = None
-    """None of a flight whose log does not show the ticks."""
+    """None if the log of the flight does not show the ticks."""
     refused: dict[str, int] = Field(default_factory=dict[str, int])
     mirror: dict[str, int] = Field(default_factory=dict[str, int])
     mode_changes: tuple[Annotated[Event, PlainSerializer(event_fields)], ...] = ()
@@ -164,7 +164,7 @@ class Summary(Published):
 
     @property
     def spacing_error_final_m(self) -> float | None:
-        """The largest spacing error at the last tick."""
+        """The largest of the vehicles' last spacing errors."""
         return max(
             (v.spacing_error_final_m for v in self.vehicles if v.spacing_error_final_m is not None), default=None
         )

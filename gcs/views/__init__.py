@@ -1,1 +1,1 @@
-"""What people look at: live table, Rerun recording, pictures, pages. `report` turns results into words."""
+"""Everything that people look at: live table, Rerun recording, pictures, pages. `report` puts results into words."""

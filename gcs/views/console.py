@@ -1,6 +1,6 @@
-"""What terminals show: text as it is, numbers, tables that fit, pictures drawn anew, and progress.
+"""Terminal output: literal text, numbers, tables that fit, live displays and progress bars.
 
-What users, files and vehicles wrote is never read as markup.
+Text from users, files and vehicles is never interpreted as markup.
 """
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -18,17 +18,17 @@ from gcs.errors import beyond
 
 UNKNOWN = "–"
 _MOST_NAMED = 12
-"""Most vehicles that a line names."""
+"""Most vehicles named in a line."""
 
 Item = TypeVar("Item")
 FittedColumn = tuple[str, int, int, Callable[[Item], str | Text]]
-"""Heading, least width, least width of the terminal that shows the column, and the text for an item."""
+"""Heading, least width, least terminal width at which the column is shown, and the text for an item."""
 
 
 def plain_console(*, stderr: bool = False, soft_wrap: bool = True) -> Console:
-    """A console that reads no markup and no emoji codes in text; `soft_wrap` leaves long lines to the terminal.
+    """A console that interprets no markup or emoji codes; `soft_wrap` leaves wrapping of long lines to the terminal.
 
-    What is to have a style is a `rich.text.Text`.
+    Pass a `rich.text.Text` for styled output.
     """
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False, soft_wrap=soft_wrap)
 
@@ -44,7 +44,7 @@ def ms_text(seconds: float | None, form: str = ".1f", *, unit: str = " ms") -> s
 
 
 def growth_text(factor: float | None) -> str:
-    """What errors do that grow by at most a factor, None without bound; rounding makes 1 differ from 1 by 1e-10.
+    """In words, the growth of errors: by at most `factor`, or unbounded (None). Up to 1 + 1e-6 counts as rounding.
 
     >>> growth_text(1.0), growth_text(1.004), growth_text(1.15), growth_text(None)
     ('do not grow', 'grow at most 1.004 times', 'grow at most 1.15 times', 'grow without bound')
@@ -64,7 +64,7 @@ def table_of(
 ) -> Table:
     """A table with a row for each item; `columns` maps each heading to the function that gives an item's text.
 
-    Columns are aligned to the right, except one without a heading.
+    Columns are right-aligned, except those without a heading.
     """
     padding = (0, 1, 0, 0) if dense else (0, 1)
     table = Table(box=box.SIMPLE_HEAD, padding=padding, title=title, title_justify="left", title_style="")
@@ -76,7 +76,7 @@ def table_of(
 
 
 def fitted_table(items: Iterable[Item], columns: Sequence[FittedColumn[Item]], *, width: int, gap: int) -> Table:
-    """A table that leaves out columns on a narrow terminal; its columns stand still while their numbers change."""
+    """A table that omits columns on a narrow terminal; column positions stay fixed while the numbers change."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap, 0, 0))
     shown = [column for column in columns if width >= column[2]]
     for heading, least, _, _ in shown:
@@ -88,13 +88,13 @@ def fitted_table(items: Iterable[Item], columns: Sequence[FittedColumn[Item]], *
 
 
 def not_shown(count: int) -> list[Text]:
-    """A line about vehicles for which there is no room, if there are any."""
+    """A line with the number of vehicles not shown for lack of room, if any."""
     return [Text(f"  … {count} vehicles not shown, none of them worse", style="dim", no_wrap=True)] if count else []
 
 
 @contextmanager
 def live_display(*, shown: bool, transient: bool = False) -> Generator[Live | None]:
-    """While entered, a picture on a terminal; None where there is no terminal, or nothing is to be shown."""
+    """Yields a live display on the terminal; None without a terminal, or if nothing is to be `shown`."""
     console = plain_console(soft_wrap=False)
     if not (shown and console.is_terminal):
         yield None
@@ -104,19 +104,19 @@ def live_display(*, shown: bool, transient: bool = False) -> Generator[Live | No
 
 
 def draw(live: Live, picture: Callable[..., RenderableType]) -> None:
-    """Draw a picture of a `width` and `height`; the terminal's last line stays free, or the cursor would scroll it."""
+    """Draw a picture of `width` and `height`. The last line stays free, because the cursor would scroll it."""
     live.update(picture(width=live.console.width, height=live.console.height - 1), refresh=True)
 
 
 Ended = Callable[[int], None]
-"""Called whenever a piece of work has ended, with the number of pieces still to come."""
+"""A callback for the end of each piece of work, called with the number of pieces left."""
 
 
 @contextmanager
 def progress(*, shown: bool) -> Generator[Callable[[str], Ended]]:
-    """While entered, provides a function that begins a bar of a name; nothing is drawn where there is no terminal.
+    """Yields a function that begins a named progress bar; without a terminal nothing is drawn.
 
-    The number of pieces may change on the way, as in a search.
+    The number of pieces left may change on the way, as in a search.
     """
     from rich import progress as bars
 
@@ -146,7 +146,7 @@ def progress(*, shown: bool) -> Generator[Callable[[str], Ended]]:
 
 
 def vehicles_text(system_ids: Sequence[int]) -> str:
-    """Vehicles by their system ids; of many, the first are named."""
+    """Vehicles by their system ids, of which at most the first `_MOST_NAMED` are named."""
     named = " ".join(str(system_id) for system_id in system_ids[:_MOST_NAMED])
     more = f" and {len(system_ids) - _MOST_NAMED} more" if len(system_ids) > _MOST_NAMED else ""
     return f"vehicle{'s' * (len(system_ids) > 1)} {named}{more}"

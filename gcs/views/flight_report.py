@@ -1,4 +1,4 @@
-"""report.html of a flight: its verdict, headroom, errors, links and events on one page that needs nothing else."""
+"""report.html of a flight: its verdict, headroom, errors, links and events on one self-contained page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,16 +21,16 @@ from scenarios.schema import Scenario
 REPORT_FILE = "report.html"
 _TEMPLATE = "flight_report.html.j2"
 _NAMED = len(COLOURS)
-"""Up to this many vehicles have a colour each; of more, only those with the least headroom."""
+"""Up to this many vehicles each have a colour; of more, only the `_NAMED_OF_MANY` with the least headroom."""
 _NAMED_OF_MANY = 3
 _MOST_EVENTS = 60
 _HEADROOM_LEAST = -1.0
-"""Headrooms below this are drawn at the lower edge."""
+"""Lowest value on the headroom axis; lower headrooms are drawn at this edge."""
 _MODE_COLOURS = {mode: "#{:02x}{:02x}{:02x}".format(*color) for mode, color in MODE_COLORS.items()}
 
 
 def leave_report(folder: Path, summary: Summary) -> Summary:
-    """Write report.html of a run that has ended; returns the summary with that file, which summary.json then names.
+    """Write report.html of a finished run and add it to the files in summary.json; returns the updated summary.
 
     A report that cannot be written is named in `not_logged`.
     """
@@ -50,7 +50,7 @@ def leave_report(folder: Path, summary: Summary) -> Summary:
 
 
 def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> str:
-    """The page, as HTML; `ticks` have shape (ticks, vehicles)."""
+    """The page as HTML; `ticks` has shape (ticks, vehicles)."""
     flown = ticks[ticks["time_s"][:, 0] >= 0.0] if ticks.size else ticks
     named = _named([vehicle.headroom_min for vehicle in summary.vehicles])
     labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
@@ -74,7 +74,7 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
 
 
 def _named(least: Sequence[float | None]) -> list[int]:
-    """The vehicles, by their places, that charts tell apart: all, or those with the least headroom."""
+    """The indices of the vehicles with a colour of their own: all, or those with the least headroom."""
     if len(least) <= _NAMED:
         return list(range(len(least)))
     known = [np.inf if value is None else value for value in least]
@@ -82,7 +82,7 @@ def _named(least: Sequence[float | None]) -> list[int]:
 
 
 def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: list[str]) -> list[tuple[str, str, str]]:
-    """The charts: of each its heading, its SVG and what its lines are."""
+    """The charts: for each, its heading, its SVG and a caption."""
     time_s = flown["time_s"][:, 0]
     sent = flown["commanded"]
 
@@ -124,9 +124,9 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
 
 
 def _mode_bars(flown: TickArray, labels: list[str]) -> list[tuple[str, list[tuple[str, float, str]]]]:
-    """Of each vehicle that did not fly in NOMINAL throughout: its modes in turn, share of the time and colour.
+    """For each vehicle that left NOMINAL during the flight: its modes in order, with share of the time and colour.
 
-    Before its first command and after its last a vehicle is WAITING; that is drawn, but does not count.
+    Before its first command and after its last a vehicle is WAITING; that is drawn, but does not count as leaving.
     """
     bars: list[tuple[str, list[tuple[str, float, str]]]] = []
     for k, label in enumerate(labels):

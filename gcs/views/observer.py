@@ -1,12 +1,12 @@
-"""The observer: a process of its own that follows a flight by reading the files it leaves.
+"""The observer: a separate process that follows a flight by reading the run's files.
 
-It draws the live table and writes the Rerun recording, so that the control process does neither and never waits.
+It draws the live table and writes the Rerun recording, so the control process never waits for either.
 
     python -m gcs.views.observer FOLDER --parent PID [--no-table] [--viewer URL]
 
-The file FOLDER/.observer-ready exists from the end of all slow imports until the observer ends. The observer ends
-after the run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the
-recording is whole. It leaves SIGINT and SIGHUP to the parent, which decides how the flight ends.
+The file FOLDER/.observer-ready exists from the end of the slow imports until the observer ends. The observer ends after
+the run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the recording is
+complete. It ignores SIGINT and SIGHUP, because the parent decides how the flight ends.
 """
 
 import argparse
@@ -41,23 +41,23 @@ TABLE_S = 0.24
 SEND_S = 1.0
 ROWS_AT_ONCE = 100_000
 ORPHAN_S = 1.0
-"""Time without anything new after which an observer whose parent has died ends."""
+"""An observer whose parent has died ends after this time without new ticks or events."""
 
 
 @dataclass
 class Parent:
-    """The process that started the observer, and whether the observer was asked to stop."""
+    """The process that started the observer, and whether it told the observer to stop."""
 
     pid: int
     stop: bool = False
     has_written: bool = False
-    """It has closed our standard input: all that it writes is written."""
+    """Whether it has closed our standard input, which means that it will write nothing more."""
 
     def gone(self) -> bool:
         return os.getppid() != self.pid
 
     def wait(self) -> None:
-        """Wait until it is time for the next look."""
+        """Wait for POLL_S, or until the parent has written everything."""
         if self.has_written:
             time.sleep(POLL_S)
         else:
@@ -80,10 +80,10 @@ def main() -> int:
         signal.signal(decided_by_parent, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
-    os.environ.setdefault("RUST_LOG", "off")  # or Rerun writes errors over the table; one line at the end reports them
+    os.environ.setdefault("RUST_LOG", "off")  # keeps Rerun's errors off the table; one line at the end reports them
     sys.meta_path.insert(0, _NoPandas())
     import_recording()
-    os.nice(10)  # not before: the station waits until this is ready
+    os.nice(10)  # only now, because the station waits for the imports
     ready = arguments.folder / READY_FILE
     try:
         ready.touch()
@@ -93,7 +93,7 @@ def main() -> int:
                 arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table, viewer=arguments.viewer
             )
         if inputs is not None and parent.gone():
-            finish(arguments.folder)  # the station was killed: its run is summed up here
+            finish(arguments.folder)  # the station was killed, so its run is summarised here
     except OSError as error:  # a full disk; the flight goes on
         print(f"{arguments.folder}: {error.strerror or error}; wanted room for it, then gcs recover", file=sys.stderr)
         return 1
@@ -105,7 +105,7 @@ def main() -> int:
 def observe(
     folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool, viewer: str | None = None
 ) -> None:
-    """Follow the run in `folder` until it ends or is left alone."""
+    """Follow the run in `folder` until it ends, a stop is requested, or the parent has died and nothing new arrives."""
     system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
     tail = RunTail(folder, len(system_ids))
     state = FlightState(scenario, design)
@@ -115,7 +115,7 @@ def observe(
         ended = False
         while not ended:
             last_look = parent.stop or (parent.gone() and time.monotonic() - news > ORPHAN_S)
-            # Events before ticks: then all ticks that were written before the "end" event are read, too.
+            # Events are read before ticks: once "end" is seen, all ticks written before it are read, too.
             events = tail.events()
             ticks = by_tick(tail.ticks(), system_ids)
             ended = last_look or any(event.kind == END for event in events)
@@ -146,7 +146,7 @@ def recover_run(folder: Path) -> Summary:
     finish(folder)
     if import_recording():
         record_run(folder)
-    return leave_report(folder, finish(folder))  # again: the summary lists the files
+    return leave_report(folder, finish(folder))  # again, because the summary lists the files
 
 
 def record_run(folder: Path) -> Path:
@@ -165,7 +165,7 @@ def record_run(folder: Path) -> Path:
 
 
 def import_recording() -> bool:
-    """Import what writes recordings, which is slow; False, and one line, if Rerun is not installed."""
+    """Import the slow module that writes recordings; prints one line and returns False if Rerun is not installed."""
     try:
         import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ModuleNotFoundError as error:
@@ -177,7 +177,7 @@ def import_recording() -> bool:
 
 
 class _NoPandas:
-    """Hides pandas, where that is installed, from Rerun's Arrow: only its import is used, and takes 0.2 s."""
+    """An import hook that hides an installed pandas: pyarrow would import it, which takes 0.2 s, and not use it."""
 
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
@@ -196,11 +196,11 @@ def _recording(
 
 
 def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
-    """The run's scenario and design once both are written; None if the parent is gone before that."""
+    """Wait for the run's scenario and design to be written; None if the parent is gone or a stop is asked for first."""
     while True:
         try:
             design = read_design(folder / DESIGN_FILE)
-        except InputError:  # not yet written, or half of it
+        except InputError:  # not yet written, or not completely
             if parent.stop or parent.gone():
                 return None
             time.sleep(POLL_S)
@@ -210,5 +210,5 @@ def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
 
 if __name__ == "__main__":
     code = main()
-    gc.freeze()  # the interpreter would look for garbage once more as it ends, while the station waits
+    gc.freeze()  # skips the interpreter's final garbage collection, for which the station would wait
     sys.exit(code)

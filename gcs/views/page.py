@@ -1,4 +1,4 @@
-"""HTML pages that need nothing else: templates of this package, with their figures inside, which matplotlib draws."""
+"""Self-contained HTML pages: templates of this package with embedded figures, which matplotlib draws."""
 
 import base64
 from functools import partial
@@ -11,7 +11,7 @@ _DPI = 130
 
 
 def rendered(template: str, **values: Any) -> str:
-    """A page of this package, with the filters `ms` and `number`."""
+    """Render a template of this package, with the filters `ms` and `number`."""
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
     environment = Environment(
@@ -22,14 +22,14 @@ def rendered(template: str, **values: Any) -> str:
 
 
 def data_uri(png: Path) -> str:
-    """A picture as a data URI, which holds it whole."""
+    """A picture embedded in a data URI."""
     return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode("ascii")
 
 
 def figure_of(
     rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
 ) -> tuple[Any, Any]:
-    """A figure that needs no screen, and its plots from the top: a list, or rows of columns."""
+    """A figure that needs no screen, and its plots from the top: (rows,), or (rows, columns) with several columns."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,6 +1,6 @@
-"""Plots for scripts and notebooks, by matplotlib: what a delay does to a loop x'(t) = A0 x(t) + A1 x(t - tau).
+"""Matplotlib plots for scripts and notebooks: the effect of a delay on a loop x'(t) = A0 x(t) + A1 x(t - tau).
 
-Each draws into `axes` of matplotlib, or into the current ones of pyplot, and returns them. The front at loop delays is
+Each function draws into the given `axes`, or into pyplot's current ones, and returns them. The front at loop delays is
 drawn by `gcs.studies.front.plot_front`.
 """
 
@@ -16,7 +16,7 @@ from gains.delay.rightmost import rightmost_root, rightmost_roots
 
 
 def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None) -> Any:
-    """Real part (1/s) of the rightmost root against delay, with the windows of stability shaded and the margin named.
+    """Plot the real part (1/s) of the rightmost root against delay; stable windows are shaded, the margin is the title.
 
     Raises what `gains.analyse_delay` and `gains.rightmost_root` raise.
     """
@@ -34,7 +34,7 @@ def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: A
 def plot_root_locus(
     A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None, *, roots: int = 4
 ) -> Any:
-    """The `roots` rightmost roots with imaginary part >= 0 at each delay, coloured by delay; crossings are ringed.
+    """Plot the `roots` rightmost roots with imaginary part >= 0 at each delay, coloured by delay; crossings are ringed.
 
     Raises what `gains.analyse_delay` and `gains.rightmost_roots` raise.
     """

@@ -1,9 +1,9 @@
-"""The Rerun recording of a run, and the screen made for it. The one file that knows Rerun.
+"""The Rerun recording of a run and its screen layout. Only this file imports Rerun.
 
-Everything is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at
-0. An entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs
-about as much as a tick of two. The scene is there twice: formation/... as seen from the leader, in m north, east, down
-of it, and ground/... over the ground, local NED.
+Everything is on the timeline sim_time, which starts with the flight; of the time before it, only events are kept, at 0.
+An entity holds one value for each vehicle, in the scenario's order, so a tick of two hundred vehicles costs about as
+much as a tick of two. The scene is recorded twice: formation/... relative to the leader, in m north, east and down of
+it, and ground/... over the ground, in local NED.
 """
 
 import errno
@@ -34,16 +34,16 @@ from scenarios.schema import Scenario
 TIMELINE = "sim_time"
 TRAIL_S = 20.0
 LABELS_MAX = 40
-"""With more vehicles than this, their names would cover the scene."""
+"""Most vehicles with labels; more would cover the scene."""
 LEGEND_MAX = 8
-"""The same for the legend of a plot."""
+"""Most vehicles with a legend; more would cover the plot."""
 _CURVES = {
     "delay/loop_ms": ("loop_delay_s", 1e3),
     "headroom/percent": ("headroom", 100.0),
     "command/north_m_s2": ("command_north_m_s2", 1.0),
     "command/east_m_s2": ("command_east_m_s2", 1.0),
 }
-"""Curves with one line for each vehicle: the column of the ticks, and what it is multiplied by."""
+"""Curves with one line for each vehicle: the column of the tick record, and the factor to the unit shown."""
 
 LIMIT_COLOR: Color = (255, 72, 66)
 PALE: Color = (130, 135, 145)
@@ -56,14 +56,14 @@ class Level(NamedTuple):
     name: str
     value: float
     limit: bool = False
-    """Not to be crossed; drawn bold."""
+    """Whether it is a limit that curves should not cross; drawn bold."""
 
 
 class Recording:
-    """Writes flight.rrd of one run folder while entered: `add` as often as wanted, `send` about once a second.
+    """Context manager that writes flight.rrd of one run: call `add` as often as wanted, `send` about once a second.
 
-    Until the end the file has another name, so a flight.rrd is always whole. A viewer, given by its URL, is sent the
-    same; if it is closed, the file goes on.
+    The file has another name until the end, so a flight.rrd is always complete. A viewer, given by its URL, is sent the
+    same data; if it is closed, writing to the file continues.
     """
 
     def __init__(self, folder: Path, scenario: Scenario, design: Design, viewer: str | None = None) -> None:
@@ -95,13 +95,13 @@ class Recording:
         return self
 
     def add(self, ticks: TickArray, events: list[Event]) -> None:
-        """Take whole ticks, shape (ticks, vehicles), and events; nothing is written yet."""
+        """Buffer whole ticks, shape (ticks, vehicles), and events; `send` writes them."""
         if ticks.size:
             self._ticks.append(ticks)
         self._events += events
 
     def redesigned(self, design: Design) -> None:
-        """Name the margins of another design."""
+        """Show the margins of another design in the plot titles."""
         self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
@@ -119,7 +119,7 @@ class Recording:
             self._send_scene(ticks)
 
     def __exit__(self, *_: object) -> None:
-        """Write what is left and give the file its final name; raises OSError if not all of it could be written."""
+        """Write the rest and give the file its final name; raises OSError if not all of it could be written."""
         self.send()
         try:
             self._stream.flush()
@@ -147,13 +147,13 @@ class Recording:
             self._scalars("delay/margin_ms", times_s, np.where(np.isfinite(margins_ms), margins_ms, np.nan))
         if self._predicts:
             self._scalars("delay/assumed_ms", times_s, 1e3 * ticks["assumed_delay_s"])
-        # Round trips end at some ticks only: each is shown until the next.
+        # Only some ticks have a new round trip: each is shown until the next.
         self._scalars("delay/rtt_ms", times_s, self._newest_rtt_ms.fill(1e3 * ticks["rtt_s"]))
         for level in self._levels:
             self._scalars(level.path, times_s[[0, -1]], np.full((2, 1), level.value))
 
     def _send_modes(self, ticks: TickArray) -> None:
-        """The changes only; a vehicle that is not nominal has its mode on its label."""
+        """Send mode changes only, and labels that show the mode of each vehicle that is not NOMINAL."""
         modes = np.vstack([self._modes, ticks["mode"]])
         times_s = ticks["time_s"][:, 0]
         for k, line in zip(*np.nonzero(np.diff(modes, axis=0).T), strict=True):
@@ -170,7 +170,7 @@ class Recording:
         self._modes = modes[-1]
 
     def _send_scene(self, ticks: TickArray) -> None:
-        """Positions at each tick's own instant, seen from the leader and over the ground."""
+        """Send positions at the instant of their tick, relative to the leader and over the ground."""
         all_m = self._newest_m.fill(scene.positions_m(ticks))
         shown = list(self._picture_times.pick(ticks["time_s"][:, 0]))
         if not shown:
@@ -200,7 +200,7 @@ class Recording:
         self._columns(f"{root}/wanted", times_s, centers)
 
     def _send_trail(self, root: str, times_s: FloatArray, place_m: FloatArray) -> None:
-        """The pieces flown since the ends before, each logged once; the view shows those of the last seconds."""
+        """Send the trail segments since the last call, each once; the view shows those of the last TRAIL_S."""
         ends_m = np.concatenate([self._trail_ends_m.get(root, place_m[:0]), place_m])
         self._trail_ends_m[root] = place_m[-1:]
         if (pieces := len(ends_m) - 1) > 0:
@@ -236,7 +236,7 @@ class Recording:
         lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
         for path in _CURVES:
             lines(path, labels, colors)
-        dimmed: list[Color] = [(r // 2 + 10, g // 2 + 10, b // 2 + 12) for r, g, b in colors]  # to the dark ground
+        dimmed: list[Color] = [(r // 2 + 10, g // 2 + 10, b // 2 + 12) for r, g, b in colors]  # on the dark background
         lines("delay/rtt_ms", [f"{label} RTT" for label in labels], dimmed, 0.8)
         if self._predicts:
             lines("delay/assumed_ms", [f"{label} assumed" for label in labels], colors)
@@ -250,9 +250,9 @@ class Recording:
 
 
 def length_s(recording: Path) -> float | None:
-    """The last scenario time of a recording, None if nothing in it has a time."""
+    """The last scenario time (s) in a recording; None if nothing in it has a time."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it was cut short: what is left may suffice
+        warnings.simplefilter("ignore")  # of a truncated file, the rest may suffice
         chunks = [chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names]
     columns = (chunk.to_record_batch().column(TIMELINE).cast("int64") for chunk in chunks)
     return max((1e-9 * time_ns for column in columns for time_ns in column.to_pylist()), default=None)
@@ -264,23 +264,23 @@ def viewer_client(address: str) -> Any:
 
 
 def _levels(scenario: Scenario) -> list[Level]:
-    """What the curves are compared with, and zero where it would be out of sight."""
+    """Reference lines for the curves, and lines at zero to keep it in view."""
     levels = [Level("delay/zero", "0", 0.0), Level("headroom/all", "100 %", 100.0)]
     levels.append(Level("headroom/none", "0 %: loop delay = margin", 0.0, limit=True))
     spacings_m = [math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m is not None]
     settled_m = sorted({round(scenario.safety.settled_fraction * spacing_m, 6) for spacing_m in spacings_m})
-    # With spacings of many lengths, the least and the greatest bound enclose the others.
+    # If spacings have many lengths, only the least and the greatest bound are shown.
     ends_m = settled_m if len(settled_m) <= 2 else [settled_m[0], settled_m[-1]]
     return levels + [Level(f"spacing/settled_{k}_m", f"settled: < {end:.2f} m", end) for k, end in enumerate(ends_m)]
 
 
 def _segments(start_m: FloatArray, end_m: FloatArray) -> Any:
-    """Straight lines between points of the same shape (..., 3): (lines, 2, 3)."""
+    """Straight lines (lines, 2, 3) between start and end points of the same shape (..., 3)."""
     return np.stack([start_m, end_m], axis=-2).reshape(-1, 2, 3)
 
 
 def _event_level(event: Event) -> str:
-    """How bad an event is: of a change of mode, the mode it ends in counts."""
+    """The log level of an event; for a change of mode, that of the new mode."""
     last = event.text.upper().split("->")[-1]
     if any(word in last for word in ("CRITICAL", "LOST", "FAILSAFE")):
         return "ERROR"
@@ -288,12 +288,12 @@ def _event_level(event: Event) -> str:
 
 
 def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
-    """The screen: the scene on the left, with modes and events; plots on the right; time below.
+    """The screen layout: the scene with modes and events on the left, the plots on the right, the time panel below.
 
-    The scene shows the newest time while `following`, else the time of the cursor.
+    With `following`, the cursor follows the newest time; without, it is paused.
     """
 
-    # all plots show the whole flight on the same axis, wherever the cursor is; at the right a little room for a label
+    # every plot shows the whole flight on the same time axis, wherever the cursor is, with room for a label at its end
     start, end = (rrb.TimeRangeBoundary.absolute(seconds=at_s) for at_s in (0.0, 1.03 * scenario.duration_s))
     whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end))
 
@@ -306,7 +306,7 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
     margins = f"; of the fastest gains {known}" if known else ""
     few = len(scenario.vehicles) <= LEGEND_MAX
     events = rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text has it, and times before 0
+        timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text has the time, even before 0
         text_log_columns=[TextLogColumn(kind="loglevel"), TextLogColumn(kind="body")],
     )
     return rrb.Blueprint(
@@ -339,11 +339,11 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
 
 
 def _scene_view(root: str, scenario: Scenario) -> Any:
-    """A 3D view from behind and above, far enough away to show the whole wanted formation."""
+    """A 3D view from behind and above, far enough away to show the whole formation in its places."""
     place_m = plan_formation(scenario).place_ne_m()
     lowest_m, highest_m = place_m.min(axis=0), place_m.max(axis=0)
     middle_m, reach_m = (lowest_m + highest_m) / 2, (highest_m - lowest_m) / 2
-    # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
+    # The southern end of a formation that is long from north to south is near the eye, so it needs more distance.
     radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0
     if root == "formation":
         name, tracked, down_m = "Formation, seen from the leader, north up [m]", None, 0.0

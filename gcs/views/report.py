@@ -1,4 +1,4 @@
-"""What the terminal shows before and after a flight: the design and the summary."""
+"""Terminal output before and after a flight: the design and the summary."""
 
 from collections.abc import Callable, Sequence
 from math import inf
@@ -27,11 +27,11 @@ from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_
 from scenarios.schema import GainBlock
 
 _HASH = 12
-"""Digits of a hash that are shown."""
+"""Number of digits shown of a hash."""
 
 
 def print_design(design: Design, console: Console | None = None) -> None:
-    """Gains, robustness, both margins, and the trade-off between robustness and margin."""
+    """Print the gains, the robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
     console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
     if design.code:
@@ -135,7 +135,7 @@ def _print_margins(design: Design, console: Console) -> None:
 
 
 def windows_table(prediction: PredictionPart) -> Table:
-    """The mismatch windows of a station that predicts, a row for each assumed delay."""
+    """The mismatch windows of a predicting station, one row for each assumed delay."""
     return table_of(prediction.windows, _WINDOW_COLUMNS, title="stable between, with prediction")
 
 
@@ -170,7 +170,7 @@ def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> 
 
 
 def figures_text(flown: FiguresAtDelay, at: str = "at {} of loop delay") -> str:
-    """α at a loop delay and, where spacing errors propagate along a chain, their growth there, in words."""
+    """In words, α at a loop delay and, if spacing errors propagate along a chain, their growth at that delay."""
     delay = at.format(ms_text(flown.loop_delay_s))
     if not flown.has_string_verdict:
         return f"{flown.alpha:.4f} of the whole formation {delay}"
@@ -184,7 +184,7 @@ def _up_to(delay_s: float | None) -> str:
 
 
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
-    """A block: one number if it is the same on both axes and does not couple them, else all four."""
+    """A 2 x 2 block as text: one number if both axes have the same gain and are uncoupled, else all four."""
     if not columns:
         return UNKNOWN
     (a, c), (b, d) = columns
@@ -201,7 +201,7 @@ _BLOCK_COLUMNS: dict[str, Callable[[GainBlock], str]] = {
     "spacing error, 1/s²": lambda block: _matrix(list(zip(*block.gain, strict=True))[:-2]),
     "velocity error, 1/s": lambda block: _matrix(list(zip(*block.gain, strict=True))[-2:]),
 }
-"""The gain matrix by blocks: which vehicle uses whose errors, with which gain."""
+"""The gain matrix block by block: the vehicle, whose errors it uses, and the gains."""
 _VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
     "vehicle": lambda own: str(own.system_id),
     "error, m\nlargest": lambda own: number_text(own.spacing_error_max_m, ".2f"),
@@ -216,7 +216,7 @@ _VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
 
 
 def print_summary(summary: Summary, folder: Path) -> None:
-    """The verdict with its figures, and where the files are."""
+    """Print the verdict with its figures, and the location of the files."""
     console = plain_console()
     print_flight(summary, console)
     console.print(f"files    {folder}: {', '.join(summary.files)}")
@@ -227,14 +227,14 @@ def print_summary(summary: Summary, folder: Path) -> None:
 
 
 def flight_lines(summary: Summary) -> dict[str, str]:
-    """What is said of a flight as a whole, by its headings; `verdict` without the verdict itself."""
+    """The lines about a flight as a whole, by heading; `verdict` holds the reason without the verdict itself."""
     flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
     lines = {"verdict": f"{_reason(summary)}{flown}", "delay": delay_text(summary)}
     if summary.verdict == "unstable" and (summary.headroom_end or 0.0) >= 0.0:
         lines["delay"] += "; set-points that were lost do not show in it"
     if (alpha := summary.at_loop_delay.alpha) is not None:
         lines["alpha"] = figures_text(summary.at_loop_delay)
-        if summary.verdict == "unstable":  # what the model says of errors is not what they did
+        if summary.verdict == "unstable":  # the model's growth of errors is not what was flown
             at = ms_text(summary.at_loop_delay.loop_delay_s)
             lines["alpha"] = f"{alpha:.4f} by the model of small errors at {at} of loop delay, the largest median"
     if modes := _modes_text(summary):
@@ -279,7 +279,7 @@ def print_flight(summary: Summary, console: Console) -> None:
 
 
 def _modes_text(summary: Summary) -> str:
-    """How long vehicles were where the station had to act, or could not."""
+    """Which vehicles were in FAILSAFE, LOST or CRITICAL, and for how long; empty if none."""
     end_s = summary.duration_s or 0.0
     until_s = {vehicle.system_id: end_s for vehicle in summary.vehicles}
     in_mode_s = {mode: dict.fromkeys(until_s, 0.0) for mode in (Mode.FAILSAFE, Mode.LOST, Mode.CRITICAL)}
@@ -298,7 +298,7 @@ def _modes_text(summary: Summary) -> str:
 
 
 def _spread_text(spread: FlownSpread) -> str:
-    """The rms of the follower whose errors are predicted to spread most, and how far all are from what is predicted."""
+    """The rms of the follower with the largest predicted spread, and the deviation of all from their predictions."""
     most = max(spread.vehicles, key=lambda own: own.predicted_rms_m or 0.0)
     apart = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) - 1.0 for own in spread.vehicles]
     of_all = "" if len(apart) == 1 else f", all vehicles {min(apart):+.1%} to {max(apart):+.1%}"
@@ -309,7 +309,7 @@ def _spread_text(spread: FlownSpread) -> str:
 
 
 def _reason(summary: Summary) -> str:
-    """How the flight ended; for a completed but unstable flight, why it is unstable."""
+    """How the flight ended or, if it was completed but unstable, why it counts as unstable."""
     final_m, most_m = summary.spacing_error_final_m, summary.spacing_error_max_m
     completed = summary.reason.startswith("completed")
     if summary.verdict != "unstable" or not completed or final_m is None or most_m is None:
@@ -347,7 +347,7 @@ def delay_text(summary: Summary) -> str:
 
 
 def response_text(response: ResponsePart | None) -> str:
-    """A line on how the vehicles respond to set-points; empty if they respond at once."""
+    """A line about the vehicles' response to set-points; empty if they respond at once."""
     if response is None:
         return ""
     if not response.vehicles:

@@ -1,4 +1,4 @@
-"""The formation as a picture: from tick rows to points and lines in space. Arrays and text; `recording` draws them."""
+"""Turns tick rows into points and lines in space. It makes arrays and text only; `recording` draws them."""
 
 import colorsys
 import math
@@ -17,13 +17,13 @@ from scenarios.schema import Scenario
 Color = tuple[int, int, int]
 
 PICTURE_S = 0.04
-"""Least time between two pictures: 25 a second look smooth."""
+"""Least time between two pictures; 25 a second look smooth."""
 TRAIL_STEP_S = 0.2
 WIDTH, HEIGHT = 64, 16
 _ASPECT = 2.0
-"""Of the plan view; a character is about twice as high as wide."""
+"""Height to width of a character in the plan view."""
 
-# Ten colours that are easy to tell apart on a dark ground; more vehicles take hues around the circle.
+# Ten colours that are easy to tell apart on a dark background; more vehicles get hues around the colour circle.
 PALETTE: tuple[Color, ...] = (
     (240, 240, 240), (66, 165, 245), (255, 167, 38), (102, 187, 106), (236, 90, 160),
     (255, 238, 88), (38, 198, 218), (171, 130, 255), (239, 83, 80), (174, 213, 129),
@@ -44,7 +44,7 @@ def vehicle_colors(count: int) -> list[Color]:
     """One colour for each vehicle, in the scenario's order; the same in every view."""
     if count <= len(PALETTE):
         return list(PALETTE[:count])
-    golden = (math.sqrt(5) - 1) / 2  # steps of the golden ratio never come close to an earlier hue
+    golden = (math.sqrt(5) - 1) / 2  # steps of the golden ratio keep each hue away from all earlier ones
     colors = (colorsys.hsv_to_rgb(k * golden % 1, 0.55 + 0.2 * (k % 2), 1.0) for k in range(count))
     return [(int(255 * red), int(255 * green), int(255 * blue)) for red, green, blue in colors]
 
@@ -58,12 +58,12 @@ class Tree:
     fronts: list[int]
     """For each follower, the vehicle that it follows."""
     offsets_m: FloatArray
-    """For each follower, its wanted position relative to that vehicle when the flight begins: (followers, 3), NED."""
+    """For each follower, its place relative to that vehicle at the start of the flight: (followers, 3), NED."""
     places_m: Callable[[float], FloatArray] | None = None
-    """The places (vehicles, 3) relative to the leader at a scenario time, if they change in flight."""
+    """The places (vehicles, 3) at a scenario time: north and east of the leader, local down; None if constant."""
 
     def offsets_at_m(self, times_s: FloatArray) -> FloatArray:
-        """The wanted positions at these times: (times, followers, 3), or (followers, 3) if they are always the same."""
+        """The offsets at these times: (times, followers, 3), or (followers, 3) if they never change."""
         if self.places_m is None:
             return self.offsets_m
         places_m = np.stack([self.places_m(time_s) for time_s in times_s.tolist()])
@@ -93,13 +93,13 @@ def tree_of(scenario: Scenario) -> Tree:
 
 
 class Newest:
-    """Fills gaps in time: NaN is replaced by the newest known value."""
+    """Fills gaps in a time series: replaces NaN by the newest known value."""
 
     def __init__(self, *shape: int) -> None:
         self._last = np.full(shape, np.nan)
 
     def fill(self, values: FloatArray) -> FloatArray:
-        """`values` with time as its first axis, its gaps filled; still NaN before the first known value."""
+        """`values`, whose first axis is time, with gaps filled; NaN remains before the first known value."""
         filled = np.empty_like(values)
         for k, line in enumerate(values):
             filled[k] = self._last = np.where(np.isnan(line), self._last, line)
@@ -107,7 +107,7 @@ class Newest:
 
 
 class PictureTimes:
-    """Picks from a stream of instants those that are at least some time apart."""
+    """Picks times that are at least `step_s` apart from a stream of times."""
 
     def __init__(self, step_s: float) -> None:
         self._step_s = step_s
@@ -123,8 +123,8 @@ class PictureTimes:
 def positions_m(ticks: TickArray) -> FloatArray:
     """Positions (ticks, vehicles, 3), NED, all extrapolated to the instant of their tick.
 
-    The states used by one tick were sampled at different instants; at 91 m/s that makes several metres. A state of
-    unknown age is not extrapolated.
+    The states used by one tick were sampled at different instants; at 91 m/s the difference is several metres. A state
+    of unknown age is not extrapolated.
     """
     sampled_m = np.stack([ticks["north_m"], ticks["east_m"], ticks["down_m"]], axis=2)
     axes = ("velocity_north_m_s", "velocity_east_m_s", "velocity_down_m_s")
@@ -133,7 +133,7 @@ def positions_m(ticks: TickArray) -> FloatArray:
 
 
 def plan_view(place_ne_m: Mapping[int, tuple[float, float]]) -> str:
-    """The formation from above, in characters: system ids, north up; of vehicles in one cell the first is shown."""
+    """The formation from above as text: system ids, north up. Of vehicles in the same cell, the first is shown."""
     north = [n for n, _ in place_ne_m.values()]
     east = [e for _, e in place_ne_m.values()]
     apart_m = min((math.hypot(a[0] - b[0], a[1] - b[1]) for a, b in combinations(place_ne_m.values(), 2)), default=1.0)

@@ -1,6 +1,6 @@
-"""Small charts as SVG text: lines over time, readable in a page of any width.
+"""Small charts as SVG text: lines over time, readable on a page of any width.
 
-Lines are thinned to the extremes of each column of the picture, so no peak is lost and a long flight stays small.
+Lines are thinned to the extremes of each column of the picture: no peak is lost, and a long flight stays small.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ OTHERS = "#b9c2cc"
 _WIDTH, _HEIGHT = 560, 240
 _LEFT, _RIGHT, _TOP, _BOTTOM = 50, 12, 12, 38
 _COLUMNS = 250
-"""Columns to which a line is thinned."""
+"""Number of columns to which a line is thinned."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line: values (k,) at the chart's times, NaN where there is none. An empty label leaves it out of the key."""
+    """One line: values (k,) at the chart's times, NaN for gaps. A line with a label is drawn thicker, and on top."""
 
     values: FloatArray
     label: str = ""
@@ -32,7 +32,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Level:
-    """A horizontal line across the chart with a word at its right end."""
+    """A horizontal line across the chart, labelled at its right end."""
 
     value: float
     label: str
@@ -49,9 +49,9 @@ def chart(
     least: float | None = None,
     most: float | None = None,
 ) -> str:
-    """A chart of lines over the whole of `time_s` (k,), which ascends, in s.
+    """A chart of lines over the whole of `time_s` (k,), in s, ascending.
 
-    The values reach from `least` to `most`; where these are None, as far as lines and levels do.
+    The axis of values spans `least` to `most`; None takes the extreme of lines and levels. Both are rounded outwards.
     """
     known = [line.values[np.isfinite(line.values)] for line in lines]
     values = np.concatenate([*known, [level.value for level in levels]]) if known or levels else np.zeros(1)
@@ -76,13 +76,13 @@ def chart(
         box=(_WIDTH, _HEIGHT),
         edges=(_LEFT, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM),
         marks=[(y(mark), f"{mark:g}") for mark in marks],
-        # the last one ends at the edge: no tick is cut off
+        # the text of the last mark ends at the edge, or it would be cut off
         times=[
             (x(mark), f"{mark:g}", "end" if mark == end_s else "middle")
             for mark in _ticks(start_s, end_s)
             if start_s <= mark <= end_s
         ],
-        # those with a label last: they lie above the others
+        # labelled lines last, above the others
         lines=[
             (line, [" ".join(f"{x(at_s):.1f},{y(value):.1f}" for at_s, value in run) for run in _runs(time_s, line)])
             for line in sorted(lines, key=lambda line: bool(line.label))
@@ -92,7 +92,7 @@ def chart(
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Round numbers, about five, that enclose the range."""
+    """About five equally spaced round numbers that enclose the range."""
     rough = (high - low) / 5.0
     size = 10.0 ** floor(log10(rough))
     step = next(size * factor for factor in (1.0, 2.0, 5.0, 10.0) if size * factor >= rough * 0.999)
@@ -100,11 +100,11 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _thinned(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The least and the largest value of each column, in order of time; a column without any gives NaN."""
+    """The least and the greatest value in each column, in order of time; NaN for a column without values."""
     if len(values) <= 2 * _COLUMNS:
         return time_s, values
     edges = np.array([part[0] for part in np.array_split(np.arange(len(values)), _COLUMNS)] + [len(values)])
-    at = edges[:-1, np.newaxis] + np.arange(np.diff(edges).max())  # a column each line
+    at = edges[:-1, np.newaxis] + np.arange(np.diff(edges).max())  # one row for each column of the picture
     own = np.where(at < edges[1:, np.newaxis], values[np.minimum(at, len(values) - 1)], np.nan)
     least = np.argmin(np.where(np.isnan(own), np.inf, own), axis=1)
     most = np.argmax(np.where(np.isnan(own), -np.inf, own), axis=1)
@@ -113,7 +113,7 @@ def _thinned(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _runs(time_s: FloatArray, line: Line) -> list[list[tuple[float, float]]]:
-    """The pieces of a line, thinned, between values that are not finite."""
+    """The thinned line, split at values that are not finite."""
     runs: list[list[tuple[float, float]]] = [[]]
     times_s, values = _thinned(time_s, line.values)
     for at_s, value in zip(times_s.tolist(), values.tolist(), strict=True):

@@ -1,6 +1,6 @@
 """The live table: how close each vehicle of the formation is to its delay margin, while it flies.
 
-`FlightState` remembers what the table shows, `render` draws it, `plain_line` says it in one line where there is no
+`FlightState` holds the data of the table, `render` draws it, `plain_line` puts it on one line where there is no
 terminal, and `Display` chooses between the two.
 """
 
@@ -40,16 +40,16 @@ from gcs.views.scene import Newest
 from scenarios.schema import Scenario
 
 WINDOW_S = 5.0
-"""The last seconds, over which percentiles and the least headroom are taken."""
+"""Window of the last seconds for percentiles and the least headroom."""
 PLAIN_EVERY_S = 5.0
 EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
 """Equal events within this time share a line."""
 _NEVER = sys.maxsize
-"""Terminal width from which a column is shown that a flight has no use for."""
+"""Least terminal width of a column that a flight does not need: it is never shown."""
 
 HEADROOM_GOOD = 0.3
-"""Headroom of at least this much is shown in green."""
+"""Headroom from which it is shown in green."""
 MODE_STYLES: dict[Mode, str] = {
     Mode.NOMINAL: "green",
     Mode.WAITING: "dim",
@@ -59,28 +59,28 @@ MODE_STYLES: dict[Mode, str] = {
     Mode.FAILSAFE: "bold magenta",
     Mode.LOST: "bold red",
 }
-"""Modes, from good to bad."""
+"""Style of each mode, from the best mode to the worst."""
 _BADNESS = list(MODE_STYLES)
 
 
 class FlightState:
-    """What is known of a flight from the ticks and events read so far."""
+    """The state of a flight according to the ticks and events read so far."""
 
     def __init__(self, scenario: Scenario, design: Design) -> None:
         self.scenario = scenario
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
-        """What the station refused, in words."""
+        """What the station has refused, in words."""
         self.without_target = set[int]()
-        """Vehicles that do not report which set-point acts."""
+        """Vehicles that do not report which set-point is acting."""
         self.time_s = np.nan
         self.before_s = patience_s(scenario)
-        """Scenario time plus this is the time since the station started; shown until the flight begins at 0."""
+        """Offset from scenario time to the time since the station started, which is shown until the flight begins."""
         self.skipped = 0
-        """Ticks that were left out."""
+        """Number of ticks that the station skipped."""
         self.news: list[str] = []
-        """The newest events; equal events of several vehicles are one line."""
+        """The newest events, one line each; equal events of several vehicles share a line."""
         self._last_event: tuple[str, str, float] | None = None
         self._named: list[int] = []
         self.system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
@@ -100,7 +100,7 @@ class FlightState:
         """Delay margin of the fastest gains."""
 
     def at_delay(self, figures: "Figures") -> str:
-        """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
+        """In words, α and the growth of spacing errors at the largest median loop delay, rounded to the millisecond."""
         delay_s = _worst(figures.loop_delay_s_p50)
         if np.isnan(delay_s):
             return ""
@@ -113,7 +113,7 @@ class FlightState:
         return self._at_delay[key]
 
     def add(self, ticks: TickArray, events: list[Event]) -> None:
-        """Take whole ticks, shape (ticks, vehicles), and events."""
+        """Update the state with whole ticks, shape (ticks, vehicles), and events."""
         for event in events:
             if event.kind == "phase":
                 self.phase = event.text
@@ -144,7 +144,7 @@ class FlightState:
         self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
 
     def figures(self) -> "Figures":
-        """The figures to be shown; NaN where unknown. At the end they are those of the last commands of the flight."""
+        """The figures to show; NaN where unknown. After the flight they stay those of its last commands."""
         now, flown = self.newest, self._window[self._window["commanded"].any(axis=1)]
         window = flown if flown.size else self._window
         heard = window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
@@ -163,7 +163,7 @@ class FlightState:
 
 @dataclass(frozen=True)
 class Figures:
-    """One value for each vehicle, in the scenario's order; the percentiles and the headroom of the last seconds."""
+    """Figures of each vehicle, in the scenario's order; percentiles and least headroom are over the last WINDOW_S."""
 
     spacing_error_m: FloatArray
     loop_delay_s_p50: FloatArray
@@ -172,11 +172,11 @@ class Figures:
     modes: list[Mode]
     lateness_s_p99: float
     gain_set: int
-    """The slowest that any vehicle is flown with."""
+    """The slowest gain set with which any vehicle is flown."""
 
 
 def render(state: FlightState, *, width: int, height: int) -> RenderableType:
-    """The whole display, in at most `height` lines: as many vehicles as fit, and how many do not."""
+    """The whole display, in at most `height` lines: as many vehicles as fit, and the number of the others."""
     figures, duration_s = state.figures(), state.scenario.duration_s
     done_s = min(max(np.nan_to_num(state.time_s), 0.0), duration_s)
     bar = ProgressBar(total=duration_s, completed=done_s, width=max(width - 28, 10))
@@ -185,7 +185,7 @@ def render(state: FlightState, *, width: int, height: int) -> RenderableType:
     foot = _footer(state, figures)
     order = list(range(len(state.system_ids)))
     room = max(height - len(foot) - 6, 2)  # 6: two lines above the table, two of headings, the rule, an empty line
-    if len(order) > room:  # first those in the worst mode, within a mode those with the least headroom
+    if len(order) > room:  # keeps the vehicles in the worst modes, within a mode those with the least headroom
         headroom = np.nan_to_num(figures.headroom, nan=np.inf)
         order.sort(key=lambda k: (-_BADNESS.index(figures.modes[k]), headroom[k]))
         order = sorted(order[: room - 1])
@@ -257,26 +257,26 @@ def plain_line(state: FlightState) -> str:
 
 
 def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
-    """Time of the flight; before it, time since the station started: scenario time plus `before_s`."""
+    """The flight time or, before the flight, the time since the station started: scenario time plus `before_s`."""
     return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{number_text(time_s, form)} s"
 
 
 def at_once(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
-    """The events with the vehicles that each is about: what a tick says of several vehicles is one event."""
+    """Events with the vehicles that each is about; consecutive events equal in time, kind and text are merged."""
     same = groupby(events, key=lambda event: (event.time_s, event.kind, event.text))
     groups = [list(group) for _, group in same]
     return [(group[0], [system_id for event in group for system_id in event.about]) for group in groups]
 
 
 def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
-    """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
+    """One line of text for an event about these vehicles; `before_s` is as in `time_text`."""
     who = f"{vehicles_text(system_ids)}: " if system_ids else ""
-    kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # or the word would appear twice
+    kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # otherwise "vehicle" would appear twice
     return f"{time_text(event.time_s, before_s)}  {kind}{who}{event.text}"
 
 
 class Display:
-    """Shows a flight on standard output: as a live table on a terminal, else as lines of text."""
+    """Shows a flight on standard output: as a live table on a terminal, otherwise as lines of text."""
 
     def __init__(self, state: FlightState, live: Live | None, *, shown: bool) -> None:
         self._state = state
@@ -285,12 +285,12 @@ class Display:
         self._line_due_s = -np.inf
 
     def events(self, events: list[Event]) -> None:
-        """Print each event once, where there is no live table to show it."""
+        """Print each event once, unless the live table shows it."""
         for event, system_ids in at_once(events) if self._says_lines else ():
             print(event_text(event, system_ids, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:
-        """Show the flight as it is now; as text, every `PLAIN_EVERY_S` of scenario time and if `last`."""
+        """Show the current state; as text, only every `PLAIN_EVERY_S` of scenario time, and if `last`."""
         state = self._state
         if self._live is not None:
             draw(self._live, partial(render, state))
@@ -300,9 +300,9 @@ class Display:
 
 
 def _quantile(values: FloatArray, probability: float) -> FloatArray:
-    """A quantile (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
+    """A quantile (the nearest value above) over axis 0, ignoring NaN; NaN where all values are.
 
-    As np.nanquantile, which takes a hundred times longer with a NaN in every column.
+    It equals np.nanquantile, which takes a hundred times longer with a NaN in every column.
     """
     ordered = np.sort(np.vstack([values, np.full(values.shape[1], np.nan)]), axis=0)  # NaN last
     place = np.ceil(probability * (np.sum(~np.isnan(values), axis=0) - 1)).astype(int)  # -1 where nothing is known
@@ -321,7 +321,7 @@ def _worst_headroom(state: FlightState, figures: Figures) -> str:
 
 
 def headroom_style(headroom: float | None) -> str:
-    """The style of a headroom, dim where it is unknown."""
+    """The style in which a headroom is shown; dim if it is unknown."""
     if headroom is None or np.isnan(headroom):
         return "dim"
     return "green" if headroom >= HEADROOM_GOOD else "yellow" if headroom >= 0 else "bold red"

@@ -1,4 +1,4 @@
-"""Show a recording, or a flight while it flies: the Rerun viewer, a browser, or a picture made without a screen."""
+"""Shows a recording or a flight in progress: in the Rerun viewer, in a browser, or as a picture without a screen."""
 
 import importlib.util
 import os
@@ -34,7 +34,7 @@ def refuse_without_viewer() -> None:
 
 
 def view(folder_or_rrd: Path) -> int:
-    """Open the Rerun viewer on a recording; returns when it is closed, with its exit code."""
+    """Open a recording in the Rerun viewer and wait until it is closed; returns its exit code."""
     recording = find_recording(folder_or_rrd)
     _refuse_without_screen("--picture and --web need none")
     print(f"viewer   {recording}: until its window is closed", flush=True)
@@ -51,7 +51,7 @@ def serve(folder_or_rrd: Path) -> int:
         try:
             _wait_for(lambda: _listens("127.0.0.1", page) and _listens("127.0.0.1", data), process, log)
             at = f"http://127.0.0.1:{page}?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A{data}%2Fproxy"
-            at += "&theme=dark"  # for which the colours are chosen, as those of the labels
+            at += "&theme=dark"  # the colours of vehicles and labels are chosen for it
             print(f"web      {at}\n         until Ctrl-C", flush=True)
             return process.wait()
         except KeyboardInterrupt:
@@ -62,7 +62,7 @@ def serve(folder_or_rrd: Path) -> int:
 
 
 def new_viewer() -> str:
-    """Open a viewer that waits for a flight; returns its URL. It stays open when the flight has ended."""
+    """Open a viewer that waits for a flight, and return its URL. It stays open after the flight."""
     _refuse_without_screen("wanted --live HOST:PORT of a viewer elsewhere")
     port = _free_port()
     with tempfile.TemporaryFile() as log:
@@ -72,7 +72,7 @@ def new_viewer() -> str:
 
 
 def viewer_url(host: str, port: int) -> str:
-    """The URL of the viewer that listens at an address; raises InputError if none does."""
+    """The URL of the viewer that listens at an address; raises InputError if nothing listens there."""
     if not _listens(host, port):
         raise InputError(f"--live: nothing listens at {host}:{port}, wanted an open Rerun viewer (rerun --port {port})")
     return f"rerun+http://{host}:{port}/proxy"
@@ -98,9 +98,9 @@ def _listens(host: str, port: int) -> bool:
 
 
 def picture_time_s(recording: Path, wanted_s: float | None) -> float:
-    """The scenario time of a picture: the one wanted; by default ten seconds, or the end of the recording if sooner.
+    """The scenario time of a picture: `wanted_s`, or by default ten seconds, or the end of the recording if sooner.
 
-    Raises InputError if the recording ends before the time wanted, or holds no flight.
+    Raises InputError if the recording ends before the wanted time, or contains no flight.
     """
     from gcs.views.recording import length_s  # Rerun is slow to import, and the viewer itself does not need it
 
@@ -119,10 +119,10 @@ def picture_time_s(recording: Path, wanted_s: float | None) -> float:
 
 
 def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
-    """Write a picture of the recording's screen at a scenario time; returns what the views report as wrong.
+    """Write a picture of the recording at a scenario time; returns the problems that the viewer's views report.
 
-    Raises InputError if there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no
-    screen.
+    Raises InputError if there is no finished recording, or if the viewer does not start: it needs a Vulkan driver, but
+    no screen.
     """
     from gcs.views.recording import TIMELINE
 
@@ -131,9 +131,9 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
         viewer.open(str(recording.resolve()))
         try:
             viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
-        except ConnectionError:  # it has loaded nothing that has times
+        except ConnectionError:  # nothing with times was loaded
             raise InputError(f"{recording}: the viewer reads no flight in it, {_WANTED}") from None
-        viewer.run_command("ui.toggle_top_panel")  # of no use on a picture
+        viewer.run_command("ui.toggle_top_panel")  # hides it: useless in a picture
         png.write_bytes(_settled_picture(viewer))
         state = viewer.get_state()
     if not state.views:
@@ -142,7 +142,7 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
 
 
 def find_recording(folder_or_rrd: Path) -> Path:
-    """The finished recording of a run folder, or the file itself."""
+    """The finished recording in a run folder, or the given file itself; raises InputError if it is neither."""
     recording = folder_or_rrd / RECORDING_FILE if folder_or_rrd.is_dir() else folder_or_rrd
     if recording.is_file():
         with recording.open("rb") as opened:
@@ -158,14 +158,14 @@ def find_recording(folder_or_rrd: Path) -> Path:
 
 
 def vulkan_missing() -> bool:
-    """Whether no Vulkan driver is installed; a picture without a screen needs one."""
+    """Whether no Vulkan driver is installed. Making a picture needs one."""
     folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
     return not any(any(Path(folder).glob("*.json")) for folder in folders)
 
 
 @contextmanager
 def _headless(width: int, height: int) -> Generator[Any]:
-    """A viewer without a window, listening on a free port of this machine only."""
+    """Run a viewer without a window, listening on a free local port, and yield its client."""
     if vulkan_missing():
         raise InputError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
     command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
@@ -181,7 +181,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
 
 
 def _settled_picture(viewer: Any) -> bytes:
-    """The picture, once three in a row are equal: the viewer has loaded everything and removed its notices."""
+    """The picture once three in a row are equal, or after SETTLE_S: all is then loaded, and notices have gone."""
     pictures = [viewer.take_screenshot()]
     give_up = time.monotonic() + SETTLE_S
     while pictures[-3:] != 3 * pictures[-1:] and time.monotonic() < give_up:
@@ -190,12 +190,12 @@ def _settled_picture(viewer: Any) -> bytes:
 
 
 def _started(command: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as the package sets it when it starts a viewer
+    environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as set by the package itself when it starts a viewer
     return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
 
 
 def _wait_for(ready: Callable[[], T], process: subprocess.Popen[bytes], log: IO[bytes]) -> T:
-    """What `ready` returns once it is true; raises InputError with the viewer's last line if it does not start."""
+    """Poll `ready` and return its first true value; raises InputError with the viewer's last line if none comes."""
     give_up = time.monotonic() + START_S
     while not (found := ready()):
         if process.poll() is not None or time.monotonic() > give_up:
@@ -221,7 +221,7 @@ def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
 
 
 def _program() -> str:
-    """The viewer's binary, which comes with the Python package."""
+    """The path of the viewer's binary, which is part of the Python package."""
     package = importlib.util.find_spec("rerun_cli")
     program = Path(package.origin or "").parent / "rerun" if package else Path("rerun")
     if not program.is_file():

@@ -1,5 +1,5 @@
-"""What the frames on a link or in a telemetry log say about latency. Nothing is commanded here.
+"""Measures latency from the frames on a link or in a telemetry log, without commanding anything.
 
-Begin at `links`, which both use: `live` for `gcs monitor`, `rebuild` for `gcs replay`. `for_link` chooses gains for the
-links in a log, or for those that `before_flight` measures.
+Begin at `links`, on which the others build: `live` for `gcs monitor`, `rebuild` for `gcs replay`. `for_link` chooses
+gains for the links in a log, or for those that `before_flight` measures.
 """

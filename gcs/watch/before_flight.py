@@ -1,8 +1,8 @@
 """Measures the links of a scenario just before its flight, for `control.for_link`. Nothing is commanded.
 
-All vehicles are asked for TIMESYNC exchanges, as `gcs monitor` asks them. The measurement ends MEASURED_S after each of
-them has answered and has sent a position, and is evaluated like a log. No set-points are sent, so links that set-points
-fill are slower in flight. Simulated vehicles that `gcs fly` starts are started for the measurement alone.
+All vehicles are sent TIMESYNC requests, as by `gcs monitor`. The measurement ends MEASURED_S after every vehicle has
+answered one and has sent a position; it is evaluated like a log. No set-points are sent, so links that set-points fill
+are slower in flight. If `gcs fly` starts the vehicles, it starts them for the measurement alone.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ _TIMESYNC_HZ = 20.0
 
 
 class _Measurement:
-    """The vehicles of a scenario, what was seen of their links, and how long all of them have been there."""
+    """A measurement in progress: the observed links of a scenario's vehicles, and since when all have been heard."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -47,7 +47,7 @@ class _Measurement:
         return bool(self._complete_ns) and now_ns - self._complete_ns >= MEASURED_S * NS_PER_S
 
     def delays(self, complaint: str = "") -> LinkPart:
-        """The loop delays measured. Raises InputError if the links of any vehicle were not."""
+        """The measured loop delays. Raises InputError if any vehicle's links could not be measured."""
         measured = self.recorder.measured
         if missing := [str(system_id) for system_id in self.watch.vehicles if system_id not in measured]:
             read = complaint or f"too few TIMESYNC exchanges with vehicle{'s' * (len(missing) > 1)} {' '.join(missing)}"
@@ -61,9 +61,9 @@ def measured_now(
 ) -> LinkPart:
     """The loop delays that the scenario would have over the links of the vehicles that send to this socket.
 
-    With `start_vehicles` these are simulated ones, which end with the measurement. Without a socket, vehicles and links
-    are on a virtual clock. `shown` shows the links meanwhile. Raises InputError if the links of any vehicle cannot be
-    measured, KeyboardInterrupt if a signal ends it.
+    With `start_vehicles` these are simulated and end with the measurement. Without a socket, vehicles and links run on
+    a virtual clock. `shown` displays the links meanwhile. Raises InputError if any vehicle's links cannot be measured,
+    KeyboardInterrupt if a signal ends the measurement.
     """
     found, complaint = _Measurement(scenario), ""
     if link is None:
@@ -95,7 +95,7 @@ def measured_now(
             shown=shown,
             recorder=found.recorder,
         )
-    link.receive()  # what the vehicles sent up to their end is not part of the flight
+    link.receive()  # discards what these vehicles sent last: it is not part of the flight
     return found.delays(complaint)
 
 

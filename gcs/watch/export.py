@@ -1,8 +1,8 @@
-"""A run or a telemetry log for other tools: MCAP (Foxglove, PlotJuggler) and CSV.
+"""Exports a run or a telemetry log for other tools: as MCAP (Foxglove, PlotJuggler) or CSV.
 
 A run gives the topics `/vehicle/ID/tick`, with the columns of ticks.parquet, and `/events`. A telemetry log gives one
-topic for each sender and kind of message, `/mavlink/ID/LOCAL_POSITION_NED` for example. Times of a run count from its
-first tick on the station's clock, those of a log since 1970.
+topic for each sender and message type, for example `/mavlink/ID/LOCAL_POSITION_NED`. Times of a run count from its
+first tick on the station's clock, those of a log from 1970.
 """
 
 import csv
@@ -30,14 +30,14 @@ class Message(NamedTuple):
 
     topic: str
     table: str
-    """Its CSV file, without the extension."""
+    """Name of its CSV file, without the extension."""
     time_ns: int
     fields: dict[str, Any]
-    """The known values; unknown ones are left out."""
+    """The known values by name; unknown ones are left out."""
 
 
 def messages_of(source: Path) -> list[Message]:
-    """The messages of a run's folder or of a telemetry log, in the order of their times.
+    """The messages of a run's folder, in order of time, or of a telemetry log, in the order of the log.
 
     Raises InputError if `source` is neither.
     """
@@ -58,10 +58,10 @@ def _of_run(folder: Path) -> Iterator[Message]:
 
 
 def _since_ns(ticks: TickArray, time_s: float) -> int:
-    """The scenario time of an event as time since the first tick.
+    """Convert the scenario time of an event to ns since the first tick.
 
-    Scenario time leaps to 0 when the formation is complete, the station's clock does not: an event counts from the
-    last tick before it.
+    Scenario time jumps to 0 when the formation is complete, but the station's clock does not. The event is therefore
+    placed relative to the last tick before it.
     """
     if not ticks.size:
         return 0
@@ -78,7 +78,7 @@ def _of_log(file: Path) -> Iterator[Message]:
 
 
 def _known(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields without those that are None, NaN or infinite, for which JSON has no value."""
+    """The fields without those that are None, NaN or infinite, which JSON cannot represent."""
     return {name: value for name, value in fields.items() if plain(value) is not None}
 
 

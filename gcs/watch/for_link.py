@@ -1,8 +1,8 @@
-"""Gains for measured links: the loop delay and its spread, and the best gains for these.
+"""Chooses gains for measured links: finds the loop delay and its spread, and the best gains for these.
 
-The one-way delays and losses measured of each vehicle are drawn again at the rates of the scenario. Two designs are
-compared at the least and at the worst of these delays: gains without prediction, and gains with prediction over the
-median delay. Either keeps the wanted headroom at the worst delay.
+The measured one-way delays and losses of each vehicle are resampled at the rates of the scenario. Two designs are
+compared: gains without prediction, at the worst loop delay, and gains with prediction over the median delay, at the
+worse of the least and the worst delay. Either must keep the wanted headroom.
 """
 
 from dataclasses import replace
@@ -34,14 +34,14 @@ from scenarios.schema import FixedGains, Scenario
 
 OPTION = "--links-of"
 LEAST_SHARE = 0.2
-"""Prediction must tolerate a mismatch of at least this share of the delay to either side, and of a control period:
-delays will differ from those measured."""
+"""Prediction must tolerate a mismatch to either side of at least this share of the delay, and of at least a control
+period, because delays in flight will differ from those measured."""
 
 
 def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> LinkPart:
-    """The loop delays that a scenario would have over links that were measured; `source` says when.
+    """The loop delays that a scenario would have over measured links; `source` says where these are from.
 
-    The median of the slowest vehicle, and about it from the 1st to the 99th percentile, the widest of any vehicle.
+    The slowest vehicle's median and, around it, the widest spread of any vehicle to its 1st and to its 99th percentile.
     """
     spreads: list[list[float]] = []
     for system_id in recorder.measured:
@@ -62,19 +62,19 @@ def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> LinkPa
 
 
 def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario, LinkPart]:
-    """The scenario with the gains that are best for the links in a run's folder or a telemetry log, and why these.
+    """The scenario with the best gains for the links in a run's folder or a telemetry log, and the reasons for them.
 
     Raises InputError if the log shows too little, or no gains tolerate the delays.
     """
     log_file = found(run_or_file).log_file
     recorder = recorded(read_tlog(log_file).frames)
-    if not recorder.measured:  # one line says what is missing
+    if not recorder.measured:  # this raises the error that says what is missing
         recorder.profile(str(log_file), option=f"{OPTION}: {log_file}")
     return best_for(scenario, delays_of(recorder, str(run_or_file), scenario))
 
 
 def best_for(scenario: Scenario, delays: LinkPart) -> tuple[Scenario, LinkPart]:
-    """The scenario with the gains that are best for these delays, and why. Raises InputError if none tolerate them."""
+    """The scenario with the best gains for these delays, and the reasons. Raises InputError if none tolerate them."""
     criteria = scenario.control.criteria
     aim: Aim = "alpha_at_delay"
     if criteria is not None and criteria.maximise == "decay_rate_1_s":
@@ -135,7 +135,7 @@ def evaluated(
     ends_s: tuple[float, float],
     response: Response | None = None,
 ) -> GainsAtDelay:
-    """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
+    """Gains with their exact figures: with prediction at the worse end of the delays, without it at the longer end."""
     K, responses = gains.K, None if response is None else (response, response)
     if assumed_s is not None:
         figures = PredictedFigures(PAIR, K, period_s, assumed_s, ends_s, chain=True, response=response)

@@ -1,16 +1,16 @@
-"""The latencies of vehicles, from the frames on their links; nothing is commanded.
+"""Computes the latencies of vehicles from the frames on their links, without commanding anything.
 
-Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
+It is pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
 
 A TIMESYNC exchange counts no matter who asked: this watch, or a ground station whose requests are on the same stream.
-Before the first exchange the vehicle's clock is unknown. Delays are then measured against the fastest of the last
-frames, which makes them lower bounds.
+Before the first exchange the vehicle's clock is unknown. Delays are then measured against the fastest recent frame,
+which makes them lower bounds.
 
-Each look counts as a control tick of a station here. What such a station would not count as loop delay, because
-telemetry is slower than control, is left out here too (`gcs.control.loop_delay.repeated_s`). Until a station asks,
-vehicles send states at a rate of their own: what they are slower than the scenario's telemetry is left out as well.
-Without the scenario no rates are known, and nothing is left out. With loops on board, the delays are those of a
-vehicle's own states, not of the oldest that its command needs.
+A *look* samples how old the newest states are, as a station would at a control tick. Repetition of a state because
+telemetry is slower than control is not counted as loop delay (`gcs.control.loop_delay.repeated_s`). Until a station
+asks, vehicles send states at their own rate; repetition because it is below the scenario's is not counted either.
+Without the scenario no rates are known, and all repetition counts. With loops on board, the delays are those of a
+vehicle's own states, not of the oldest state that its command needs.
 """
 
 from array import array
@@ -36,27 +36,27 @@ if TYPE_CHECKING:
     from gcs.plan.design import Design
 
 SYSTEM_ID = 254
-"""System id of the watch's requests. Not a station's: vehicles track the sequence numbers of theirs."""
+"""System id of the watch's requests. It differs from a station's, whose sequence numbers vehicles track."""
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
-"""Mean time between two looks, each of which notes how old the newest states are."""
+"""Mean time between two looks."""
 LOWER_BOUND = "lower bound"
-"""Status of a delay measured against the fastest frame, because there was no exchange."""
+"""Status of a delay measured against the fastest frame for lack of an exchange."""
 _GOLDEN = 0.6180339887498949
 _ASKED = 4096
-"""Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
+"""Most requests remembered: those to 250 vehicles at 10 Hz over 1.6 s, or to five over 80 s."""
 _LEAST_NS = 10 * NS_PER_S
-"""The fastest frame is that of the last one to two spans of this length. A drift of 20 ppm adds 0.4 ms in two."""
+"""The fastest frame is sought over the last one to two spans of this length; 20 ppm of drift adds 0.4 ms in two."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 ASK_AGAIN_NS = 2 * NS_PER_S
-"""Time between two requests for the same vehicle's positions."""
+"""Time between two requests for positions to the same vehicle."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
 
 
 class LinkFigures(Published):
-    """What is known of one vehicle's links. Without a TIMESYNC exchange, delays are lower bounds."""
+    """The figures of one vehicle's links. Without a TIMESYNC exchange, delays are lower bounds."""
 
     system_id: int
     status: str
@@ -73,13 +73,13 @@ class LinkFigures(Published):
 
 
 class WatchReport(Published):
-    """The links that `gcs monitor` watches, and what it sent itself."""
+    """The links that `gcs monitor` watches, and the messages that it sent."""
 
     listening: str
     duration_s: float
     delay_margin_s: float | None
     margin_of: str
-    """Where the margin is from."""
+    """Where the margin comes from."""
     silent: bool
     sent: dict[str, int]
     send_errors: int
@@ -91,43 +91,43 @@ class WatchReport(Published):
 
 
 class WatchedVehicle:
-    """One vehicle as an onlooker sees it: what it sent, and how late it arrived."""
+    """One vehicle as seen by a passive observer: what it sent, and how late that arrived."""
 
     def __init__(self, system_id: int, rates: Rates | None = None) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
-        self.remote.goal = None  # nothing is wanted of it
+        self.remote.goal = None  # it is not to be brought into any state
         self.rtt_s = array("d")
         self.age_s = array("d")
         self.loop_delay_s = array("d")
-        """At each look; NaN where it is unknown, and during a silence, which is not a latency."""
+        """Ages and loop delays, one for each look; NaN where unknown and during a silence, which is not a latency."""
         self._judged = 0
-        """Looks up to the newest state. The next state shows whether later looks saw a latency or a silence."""
+        """Number of looks up to the newest state. Later looks saw a latency or a silence; the next state decides."""
         self.states = 0
         """Position reports received."""
         self.first_state_ns = 0
         self.state_ns = 0
-        """When the newest one was received."""
+        """When the newest state was received."""
         self.boot_ns = 0
-        """When it was sampled, on the vehicle's clock."""
+        """When the newest state was sampled, on the vehicle's clock."""
         self._interval_ns = 1 << 62
-        """The shortest between two states, on the vehicle's clock: losses do not lengthen it."""
+        """Shortest interval between two states on the vehicle's clock, which losses do not lengthen."""
         self._rates = rates
         self._kind = mavlink.GLOBAL_POSITION_INT
         self._least_since_ns = 0
         self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
 
     def state(self, frame: mavlink.Frame, received_ns: int) -> None:
-        """Take in a position report; once local positions are sent, only they count, as formations fly by them."""
+        """Take in a position report. Once local positions arrive, only they count, because formations fly by them."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
         boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
         if frame.msg_id != self._kind or (self.states and boot_ns == self.boot_ns):
             return
         if boot_ns < self.boot_ns < boot_ns + NS_PER_S:
-            return  # overtaken
-        self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # notices a jump
+            return  # overtaken by a newer state
+        self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # detects a clock jump
         if boot_ns < self.boot_ns:
-            self._least_ns = (1 << 62, 1 << 62)  # its clock has started anew
+            self._least_ns = (1 << 62, 1 << 62)  # the vehicle's clock has restarted
         if self.states and received_ns - self.state_ns > SILENT_NS:
             for looks in (self.age_s, self.loop_delay_s):
                 looks[self._judged :] = array("d", [nan]) * (len(looks) - self._judged)
@@ -143,13 +143,13 @@ class WatchedVehicle:
 
     @property
     def least_delay_ns(self) -> int:
-        """Least reception time minus boot time among the last frames: clock offset plus the least delay."""
+        """Least reception time minus boot time among recent frames: the least delay minus the clock offset."""
         return min(self._least_ns)
 
     def look(self, now_ns: int, *, asked: bool = True) -> None:
-        """Note how old the newest state is, and how late a command computed from it would act.
+        """Sample the age of the newest state, and the loop delay of a command computed from it now.
 
-        `asked` says whether a station may have asked for the scenario's telemetry.
+        `asked` says whether a station may have requested the scenario's telemetry rates.
         """
         clock = self.remote.clock
         age_s, down_s, sampled_ns, repeated_s = nan, 0.0, 0, 0.0
@@ -166,7 +166,7 @@ class WatchedVehicle:
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s, repeated_s))
 
     def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> LinkFigures:
-        """The figures of the whole time, or of the last so many looks."""
+        """The figures over the whole time, or over the `last` looks."""
         clock, frames = self.remote.clock, self.remote.frames
         known = clock.estimate if clock.samples else None
         age_s, loop_s = (_spread(looks[: self._judged], last) for looks in (self.age_s, self.loop_delay_s))
@@ -210,11 +210,11 @@ class WatchedVehicle:
 
 
 class Watch:
-    """All vehicles of a stream. Those in `system_ids` are expected; others are added when their heartbeat is heard."""
+    """All vehicles of a stream. Those in `system_ids` are expected; others are added at their first heartbeat."""
 
     def __init__(self, system_ids: Iterable[int] = (), rates: Rates | None = None) -> None:
         self.rates = rates
-        """Those of the scenario; None if it is not known."""
+        """The rates of the scenario; None if it is not known."""
         self.vehicles = {system_id: WatchedVehicle(system_id, rates) for system_id in system_ids}
         self.stations: set[int] = set()
         """System ids of the ground stations on the stream."""
@@ -224,21 +224,21 @@ class Watch:
         self._look_ns = 0
 
     def ask(self, now_ns: int) -> int:
-        """Note a TIMESYNC request of our own that is sent now; returns its ts1."""
+        """Register a TIMESYNC request of our own that is sent now; returns its ts1."""
         while now_ns in self._asked:
             now_ns += 1
         self._note_request(now_ns, now_ns)
         return now_ns
 
     def sent(self, datagrams: Iterable[Datagram]) -> None:
-        """Note when our own requests among these datagrams were sent."""
+        """Note the exact times at which our own requests among these datagrams were sent."""
         for data, _, sent_ns, _ in datagrams:
             for frame in mavlink.decode(data, Counter()):
                 if frame.msg_id == mavlink.TIMESYNC:
                     self._asked[frame.fields[1]] = sent_ns
 
     def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
-        """Take in a frame of a vehicle or a station; returns its vehicle if it says something new."""
+        """Take in a frame of a vehicle or a station; returns the vehicle, or None if it tells nothing new of one."""
         vehicle = self._vehicle(frame)
         if vehicle is None:
             if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
@@ -262,9 +262,9 @@ class Watch:
         return vehicle
 
     def look(self, now_ns: int) -> int:
-        """Look at the ages of all vehicles' states if that is due; returns when it is due next.
+        """Sample the ages of all vehicles' states if a look is due; returns when the next is due.
 
-        Looks are unevenly spaced, so that no telemetry rate is in step with them.
+        Looks are unevenly spaced, so they never lock to a telemetry rate.
         """
         if now_ns >= self._look_ns:
             self._looks += 1
@@ -274,7 +274,7 @@ class Watch:
         return self._look_ns
 
     def figures(self, now_ns: int, design: "Design | None", last: int = 0) -> list[LinkFigures]:
-        """The figures of each vehicle, in order of system id, with the headroom to its margin in a design."""
+        """The figures of each vehicle, in order of system id, with the headroom to its margin in a design, if given."""
         margins_s = {own: None if design is None else design.margin_of(own) for own in sorted(self.vehicles)}
         return [self.vehicles[own].figures(now_ns, margin_s, last) for own, margin_s in margins_s.items()]
 
@@ -306,7 +306,7 @@ class Watch:
 
 
 def prepare() -> None:
-    """Take in a few frames, so that nothing needs to be compiled while links are measured."""
+    """Compile all kernels before links are measured, by taking in a few frames."""
     watch, sequence = Watch([1]), 0
     for now_ns in range(NS_PER_S, 4 * NS_PER_S, NS_PER_S):
         for msg_id, fields in (
@@ -322,10 +322,10 @@ def prepare() -> None:
 
 
 class Requests:
-    """TIMESYNC requests, in turn to each address that vehicles send from; all vehicles behind it answer.
+    """Sends TIMESYNC requests in turn to each address that vehicles send from; all vehicles behind it answer.
 
-    With a rate of 0 there are none. With a `position_hz`, each vehicle that sends no position is asked to report its
-    LOCAL_POSITION_NED at that rate, again and again until it does.
+    `timesync_hz` is the rate to each address; 0 sends none. With a `position_hz`, each vehicle that sends no position
+    is asked for LOCAL_POSITION_NED at that rate, every `ASK_AGAIN_NS` until it complies.
     """
 
     def __init__(self, timesync_hz: float, position_hz: float = 0.0) -> None:

@@ -1,7 +1,7 @@
-"""`gcs monitor`: the driver that watches the links of a socket and commands nothing.
+"""The driver of `gcs monitor`: watches the links at a socket and commands nothing.
 
-It sends only TIMESYNC requests and, if told to, requests for positions, under a system id that is not a station's. It
-sends no heartbeat, so that a vehicle notices when its station is gone.
+It sends only TIMESYNC requests and, on request, asks for positions, under a system id that is not a station's. It sends
+no heartbeat, which could hide from a vehicle that its station is gone.
 """
 
 import math
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SHOW_NS = NS_PER_S // 4
 _PLAIN_NS = 5 * NS_PER_S
 _WINDOW_LOOKS = 50
-"""Looks in the live figures: those of the last five seconds."""
+"""Looks in the live figures: those of the last five seconds, on average."""
 
 
 def watch_links(
@@ -39,11 +39,11 @@ def watch_links(
     shown: bool,
     recorder: LinkRecorder | None = None,
 ) -> WatchReport:
-    """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time.
+    """Watch for a number of seconds or until there is a reason to stop; returns the figures over the whole time.
 
-    `margin_of` says where the margins of `design` are from. `timesync_hz` is the rate of requests to each address, 0 to
-    send nothing. Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder` notes
-    every frame that `watch` takes.
+    `margin_of` says where the margins of `design` come from. `timesync_hz` is the rate of TIMESYNC requests to each
+    address, 0 for none. Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder`
+    notes every frame that `watch` takes.
     """
     prepare()
     requests = Requests(timesync_hz, position_hz)
@@ -69,7 +69,7 @@ def watch_links(
         period_ns = _PLAIN_NS if live is None else _SHOW_NS
         look_ns, show_ns = start_ns, start_ns + period_ns if shown else 1 << 62
         while now_ns < end_ns and not stop_reason():
-            link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
+            link.wait(min(look_ns, end_ns, requests.next_ns))  # short waits, because a signal does not end one
             for datagram in link.receive(watch.counters):
                 frames = mavlink.decode_either(datagram.data, watch.counters)
                 for frame in mavlink.in_network(frames, datagram.address[2]):

@@ -1,11 +1,11 @@
 """Rebuilds the ticks of a flight, with their latencies, errors and modes, from its telemetry log alone.
 
 The frames of the log are fed in order to the station's own code for clocks, sequence numbers and states at one instant.
-A log of this station shows its ticks by the time_boot_ms of its set-points; in any other log, ticks are placed at the
-scenario's control rate.
+In a log of this station, the time_boot_ms of its set-points identifies the ticks; in any other log, ticks are placed at
+the scenario's control rate.
 
-A log does not say how long telemetry waited in the station's socket. Nor does it say by how much the monitor had opened
-the formation, so errors are relative to the formation as designed. Lateness is relative to the most punctual tick.
+A log does not record how long telemetry waited in the station's socket, nor by how much the monitor had widened the
+formation; errors are therefore relative to the formation as designed. Lateness is relative to the most punctual tick.
 """
 
 import re
@@ -38,13 +38,13 @@ Frames = list[tuple[int, mavlink.Frame]]
 
 _ANNOUNCED = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
-"""Gaps of a log that are longer than this get no ticks."""
+"""Longer gaps in a log are not filled with ticks."""
 _LEAST_TICKS = 3
 
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """What a log shows of a flight: ticks and events in the form of a run's, and the links."""
+    """A flight rebuilt from a log: ticks and events in the form of a run's, and the links."""
 
     ticks: TickArray
     events: list[Event]
@@ -54,24 +54,24 @@ class Rebuilt:
 
 
 class _Outline(NamedTuple):
-    """What a first pass over a log shows."""
+    """The result of a first pass over a log."""
 
     base_ns: int
-    """Log time of key 0, by the most punctual set-point."""
+    """Log time of key 0, from the most punctual set-point."""
     keys: list[int]
-    """time_boot_ms of the set-points of this station's ticks; none in a log of another station."""
+    """time_boot_ms of this station's set-points, one for each tick; empty for a log of another station."""
     start_key: int
-    """The flight's first tick."""
+    """The key of the flight's first tick."""
     exchanges: bool
     """Whether TIMESYNC requests are in the log."""
 
 
 _Commands = dict[int, tuple[int, Vector]]
-"""By system id, when a set-point was sent, and its acceleration."""
+"""The set-points of one tick by system id: when each was sent, and its acceleration."""
 
 
 def rebuild(frames: Frames, scenario: Scenario, design: Design) -> Rebuilt:
-    """The flight of a scenario in a log, judged by the margins of a design."""
+    """Rebuild the flight of a scenario from a log, judged by the margins of a design."""
     flight = _Rebuilding(scenario, design, _outline(frames, scenario))
     for time_ns, frame in frames:
         flight.take(time_ns, frame)
@@ -100,7 +100,7 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
         elif frame.msg_id == mavlink.STATUSTEXT and start_key is None and sent_ns:
             announced = _announced(frame)
             if announced is not None and announced[1] == Mode.NOMINAL.name:
-                start_key = list(sent_ns)[-1]  # the station announces it at the next tick
+                start_key = list(sent_ns)[-1]  # the tick before, because the station announces it one tick later
         exchanges = exchanges or (frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0)
     keys = list(sent_ns)
     period_ms = 1e3 / scenario.rates.control_hz
@@ -112,15 +112,14 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
 
 
 def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
-    """What a STATUSTEXT of the station says about a vehicle: its mode, or the number of its gain set."""
+    """The vehicle that a STATUSTEXT of the station is about, and its mode or the number of its gain set."""
     found = _ANNOUNCED.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
 def _plan(scenario: Scenario, design: Design) -> FlightPlan:
-    """The plan that defines the errors and by which the flight is judged; it has gains only where latencies depend on
-    them."""
-    # which states a streamed command needs depends on the gains, and so does the window of a predicted loop
+    """The plan that defines the errors and margins of the flight; its gains are 0 unless latencies depend on them."""
+    # the gains decide which states a streamed command needs, and the mismatch window of a predicted loop
     if onboard_timing(scenario) is not None or scenario.control.prediction != "off":
         plan = flight_plan(scenario)[1]
         if len(design.margins_s) == len(plan.margins_s):
@@ -137,7 +136,7 @@ def _plan(scenario: Scenario, design: Design) -> FlightPlan:
 
 
 class _Rebuilding:
-    """Rebuilds, frame by frame, what the station knew of the vehicles."""
+    """Rebuilds, frame by frame, what the station knew about the vehicles."""
 
     def __init__(self, scenario: Scenario, design: Design, outline: _Outline) -> None:
         self._scenario, self._outline = scenario, outline
@@ -157,7 +156,7 @@ class _Rebuilding:
         self._states = [VehicleState()] * len(ids)
         self._jumps = [0] * len(ids)
         self._exchanges = [0] * len(ids)
-        """For each vehicle, the number of exchanges that earlier ticks have shown."""
+        """For each vehicle, the number of exchanges that earlier ticks hold."""
         self._period_ns = round(NS_PER_S / scenario.rates.control_hz)
         self._start_ns = outline.base_ns + outline.start_key * 1_000_000
         first_key, last_key = (outline.keys[0], outline.keys[-1]) if outline.keys else (0, -1)
@@ -165,7 +164,7 @@ class _Rebuilding:
         self._own_ns = (outline.base_ns + first_key * 1_000_000 - half_ns, outline.base_ns + last_key * 1_000_000)
         self._grid_ns = self._newest_ns = 0
         self._key_ms, self._commands = 0, _Commands()
-        """The tick whose set-points are being read, and those read so far."""
+        """The key of the tick whose set-points are being read, and those read so far."""
         self._rows: list[TickArray] = []
         self._events: list[Event] = []
 
@@ -188,7 +187,7 @@ class _Rebuilding:
 
     def finished(self) -> Rebuilt:
         self._close_tick()
-        self._look(self._newest_ns + self._period_ns)  # takes in what came after the last tick
+        self._look(self._newest_ns + self._period_ns)  # one more tick, which shows what arrived after the last one
         rows = in_sequence(self._rows) if self._rows else np.empty(0, TICK)
         rows = rows[np.argsort(rows["tick"], kind="stable")]
         return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys))
@@ -205,12 +204,12 @@ class _Rebuilding:
             self._commands = _Commands()
 
     def _look(self, time_ns: int) -> None:
-        """Add the ticks without set-points: those before and after this station's, or all if another wrote the log."""
+        """Add ticks without set-points: those before and after this station's, or all in another station's log."""
         if time_ns - self._grid_ns > _LONGEST_GAP_NS:
             behind = (time_ns - self._outline.base_ns) // self._period_ns
             self._grid_ns = self._outline.base_ns + behind * self._period_ns
         while self._grid_ns < time_ns:
-            if not self._outline.keys:  # vehicles count as flown once all have reported
+            if not self._outline.keys:  # vehicles count as commanded once all have reported
                 unknown = self._grid_ns, (nan, nan)
                 self._tick(self._grid_ns, dict.fromkeys(self._row, unknown) if self._history.complete else {}, 0)
             elif not self._own_ns[0] <= self._grid_ns <= self._own_ns[1]:
@@ -218,7 +217,7 @@ class _Rebuilding:
             self._grid_ns += self._period_ns
 
     def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
-        """Take in a mode or a gain set that the station announced."""
+        """Apply a mode or a gain set that the station announced."""
         system_id, announced = _announced(frame) or (0, "")
         row = self._row.get(system_id)
         if row is None:

@@ -1,4 +1,4 @@
-"""The summary of a telemetry log, as `gcs replay` shows it."""
+"""Makes the summary of a telemetry log that `gcs replay` shows."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,17 +32,17 @@ _Found = TypeVar("_Found")
 
 @dataclass(frozen=True)
 class LogSource:
-    """A log, and what the files beside it say of its flight; None for each that is not there."""
+    """A telemetry log and the contents of the files beside it; None for each file that is missing."""
 
     log_file: Path
     scenario: Scenario | None
     design: Design | None
     recorded: Summary | None
-    """The summary of the run that the log is of."""
+    """The summary of the run that wrote the log."""
 
 
 def found(run_or_file: Path) -> LogSource:
-    """The log, and the files beside it if it lies in a run's folder and is that of all vehicles."""
+    """A log, with the files beside it if it is a run's only log. Raises InputError for a run beyond network 0."""
     log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
     others = sorted(log_file.parent.glob(tlog_file("*")))
     if run_or_file.is_dir() and others:
@@ -60,7 +60,7 @@ def found(run_or_file: Path) -> LogSource:
 
 
 class LogContents(Published):
-    """What could be read of a log."""
+    """How much of a log could be read."""
 
     file: str
     frames: int
@@ -69,7 +69,7 @@ class LogContents(Published):
 
 
 class RebuildReport(Published):
-    """The summary of a log: of its links, and of the flight if the scenario is known."""
+    """The summary of a log: its links, and the flight if the scenario is known."""
 
     log: LogContents
     delay_margin_s: float | None
@@ -77,11 +77,11 @@ class RebuildReport(Published):
     links: tuple[LinkFigures, ...]
     flight: Summary | None = None
     recorded: Annotated[Summary, PlainSerializer(lambda s: s.model_dump(mode="json", include=_COMPARED))] | None = None
-    """The summary that the station made of the same flight."""
+    """The station's own summary of the same flight."""
 
 
 def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
-    """The summary of a log, with the figures that were recorded if it is in the folder of a run."""
+    """The summary of a log; for one in a run's folder, with the figures recorded in flight."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
     scenario, design = source.scenario, source.design or Design(delay_margin_s=None)
     rebuilt = None if scenario is None else rebuild(log.frames, scenario, design)
@@ -111,7 +111,7 @@ def _flight(scenario: Scenario, design: Design, rebuilt: Rebuilt) -> Summary:
 
 
 def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
-    """Why the flight ended, by its last tick."""
+    """Why the flight ended, judged by its last tick."""
     flown = rebuilt.ticks[rebuilt.ticks["commanded"] & (rebuilt.ticks["time_s"] >= 0)]
     if not rebuilt.own:
         return "the log has no set-points of this station"
@@ -130,7 +130,7 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
 
 
 def _broken(scenario: Scenario, last: TickArray) -> str:
-    """The first safety limit that the last tick violates."""
+    """The first safety limit that the last tick violates, as a reason to end the flight; "" if none."""
     closest_m, limit_m = float(np.fmin.reduce(last["nearest_m"])), scenario.safety.spacing_error_limit_m
     if closest_m < scenario.safety.collision_distance_m:
         return f"broken: vehicles have collided, {closest_m:.1f} m apart"

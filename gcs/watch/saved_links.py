@@ -1,11 +1,11 @@
-"""A link profile from what was seen of real links: one-way delays in order, and runs of lost datagrams.
+"""Makes a link profile from observed links: their one-way delays in order, and runs of lost datagrams.
 
-Up: the delays of position reports and TIMESYNC replies, each from its vehicle's time stamp. Down: those of TIMESYNC
-requests; each stands for the datagrams until the next exchange. Both depend on the estimated offset of the vehicle's
-clock, which exchanges show only within half a round trip. An error of it adds to one direction what it takes from the
-other, so their sum is right. The least delays come out equal both ways, unless the clock's bound excludes that.
+Up delays are those of position reports and TIMESYNC replies, from the vehicle's time stamps. Down delays are those of
+TIMESYNC requests; each stands for all datagrams until the next exchange. Both depend on the estimated offset of the
+vehicle's clock, which exchanges show only to within half a round trip. Its error adds to one direction what it takes
+from the other, so their sum is right. The least delays come out equal both ways, unless the clock's bound forbids it.
 
-Losses up are counted from sequence numbers. Losses down cannot be seen from here and are taken to be the same.
+Losses up are counted from sequence numbers. Losses down cannot be observed here and are assumed to be the same.
 """
 
 from collections import Counter
@@ -25,9 +25,9 @@ from scenarios.link_files import dump_profile
 _SETTLED = 20
 """Exchanges after which a clock is known well enough for one-way delays."""
 _BOOT_ROUNDING_S = 0.0005
-"""Mean of what `time_boot_ms` cuts off; subtracted, because it lengthens every delay of a position report."""
+"""Mean truncation of `time_boot_ms`. It lengthens every delay of a position report, so it is subtracted."""
 _LEAST = 10
-"""Fewest delays each way from which a profile is made."""
+"""Fewest delays each way that suffice for a profile."""
 
 
 class _OneVehicle:
@@ -43,7 +43,7 @@ class _OneVehicle:
 
 
 class LinkRecorder:
-    """Watches frames as `Watch` does, and keeps each vehicle's delays and losses."""
+    """Keeps each vehicle's delays and losses from the frames that a `Watch` has taken in."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -56,7 +56,7 @@ class LinkRecorder:
         own = self._seen.setdefault(frame.system_id, _OneVehicle())
         own.frames += 1
         gap = 0 if own.sequence is None else (frame.sequence - own.sequence) % 256
-        if gap < 128:  # else it is late
+        if gap < 128:  # otherwise the frame is late
             own.sequence = frame.sequence
             if gap > 1:
                 own.runs.append(gap - 1)
@@ -80,7 +80,7 @@ class LinkRecorder:
         return sorted(k for k, own in self._seen.items() if len(own.up_s) >= _LEAST and len(own.down_s) >= _LEAST)
 
     def profile(self, source: str, *, only: int | None = None, option: str = "--save-links") -> LinkProfile:
-        """The links of all vehicles, their delays one after the other, or of one. Raises InputError with too few."""
+        """The links of all vehicles, their delays concatenated, or of one. Raises InputError if there are too few."""
         seen = [self._seen[k] for k in self.measured if only in (None, k)]
         if not seen:
             wanted = f"{_LEAST} delays each way of a vehicle, after its first {_SETTLED} TIMESYNC exchanges"
@@ -89,8 +89,8 @@ class LinkRecorder:
         each = max(1, round(len(up) / len(down)))
         lost, received = [run for own in seen for run in own.runs], sum(own.frames for own in seen)
         loss = None
-        if lost:  # Gilbert's model: its bursts have the mean length of the runs, and begin as often
-            # a burst lasts 1 / r datagrams; it begins after p of the good ones
+        if lost:  # Gilbert's model, with bursts of the same mean length and frequency as the runs
+            # each datagram of a burst ends it with probability r, so it lasts 1 / r; each good one begins one with p
             to_bad, to_good = len(lost) / max(received, len(lost)), len(lost) / sum(lost)
             loss = LossBursts(to_bad_probability=to_bad, to_good_probability=to_good)
         bound_s = max(own.bound_s for own in seen)
@@ -104,7 +104,7 @@ class LinkRecorder:
 
 
 def recorded(frames: Iterable[tuple[int, mavlink.Frame]]) -> LinkRecorder:
-    """What a log of any tool shows of its links."""
+    """The delays and losses of the links in a log of any tool."""
     watch = Watch()
     recorder = LinkRecorder(watch)
     for time_ns, frame in frames:
@@ -123,7 +123,7 @@ def save(profile: LinkProfile, file: Path) -> None:
 
 
 def describe(profile: LinkProfile) -> list[str]:
-    """The latencies of a measured profile in the terms of RFC 7679 and RFC 5481, a line for each direction."""
+    """The latencies of a measured profile in the terms of RFC 7679 and RFC 5481, one line for each direction."""
     measured = profile.measured
     assert measured is not None
     return [
@@ -136,7 +136,7 @@ def describe(profile: LinkProfile) -> list[str]:
 
 
 def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
-    """A link that repeats these delays in their order."""
+    """A link that replays these delays in order."""
     trace = tuple(round(delay_s, 6) for delay_s in delays_s[:TRACE_DELAYS].tolist())
     return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss)
 

@@ -1,4 +1,4 @@
-"""The display of `gcs monitor`: the figures of links, as a table or as a line."""
+"""The display of `gcs monitor`: the figures of links, as a table or as one line."""
 
 from collections.abc import Sequence
 
@@ -15,13 +15,13 @@ STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "
 NOT_ASKED = "many autopilots send none until a station asks; --request asks"
 RATES_UNKNOWN = "no scenario, so no rates: repetition of a position counts as loop delay"
 _SLOW = 0.9
-"""Telemetry below this share of the scenario's rate is said to be slow."""
+"""Telemetry below this share of the scenario's rate is reported as slow."""
 _USUAL, _WIDE = 73, 140
-"""Widths of terminals from which more columns are shown."""
+"""Terminal widths from which more columns are shown."""
 
 
 def render(report: WatchReport, *, width: int, height: int | None = None) -> RenderableType:
-    """The whole display, in at most `height` lines: as many of the worst vehicles as fit, and how many do not."""
+    """The whole display, in at most `height` lines: the worst vehicles that fit, and the number of the others."""
     vehicles, notes = report.vehicles, [*_without_position(report), *_of_rates(report)]
     room = len(vehicles) if height is None else max(1, height - 6 - max(1, len(notes)))
     if len(vehicles) > room:
@@ -86,7 +86,7 @@ def _bound(figures: LinkFigures) -> str:
 
 
 def _without_position(report: WatchReport) -> list[Text]:
-    """Why there is no position, if that is so: an ArduPilot streams none unless it is asked."""
+    """A note about vehicles that send no position, if there are any: an ArduPilot streams none unless it is asked."""
     without = [str(v.system_id) for v in report.vehicles if v.loop_delay_s.p50 is None and v.received]
     if not without:
         return []
@@ -95,7 +95,7 @@ def _without_position(report: WatchReport) -> list[Text]:
 
 
 def _of_rates(report: WatchReport) -> list[Text]:
-    """That the telemetry is slower than the scenario's, or that this is not known."""
+    """A note if telemetry is slower than the scenario's rate, or if that rate is unknown."""
     if (wanted_hz := report.scenario_telemetry_hz) is None:
         return [] if report.delay_margin_s is None else [Text(RATES_UNKNOWN, "yellow")]
     slow = {v.system_id: v.telemetry_hz for v in report.vehicles if (v.telemetry_hz or wanted_hz) < _SLOW * wanted_hz}

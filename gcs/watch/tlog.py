@@ -1,6 +1,6 @@
-"""Reads telemetry logs (.tlog) of any tool: repeatedly, big-endian µs since 1970 and a MAVLink 1 or 2 frame.
+"""Reads telemetry logs (.tlog) of any tool: a sequence of big-endian µs since 1970, each with a MAVLink 1 or 2 frame.
 
-Damaged parts are left out and counted: reading goes on at the next frame with a good checksum.
+Damaged parts are skipped and counted; reading resumes at the next frame with a good checksum.
 """
 
 import re
@@ -18,19 +18,19 @@ from gcs.link.clocks import LATEST_NS
 _STAMP = struct.Struct(">Q")
 _MAGIC = re.compile(b"[\xfd\xfe]")
 _WRONG_STAMP_US = 1_000_000
-"""A stamp this far from its neighbours is wrong: no checksum covers stamps."""
+"""A stamp this far from its neighbours is taken as wrong. The checksum does not cover stamps."""
 
 
 @dataclass(frozen=True)
 class TelemetryLog:
-    """The frames of a log in its order, each with its time in ns since 1970, and counts of what was left out."""
+    """The frames of a log in order, each with its time in ns since 1970, and counts of what was left out."""
 
     frames: list[tuple[int, mavlink.Frame]]
     counters: Counter[str]
 
 
 def read_tlog(file: Path) -> TelemetryLog:
-    """Read what can be read of a log. Raises InputError if the file cannot be read or there is no frame in it."""
+    """Read the intact frames of a log. Raises InputError if the file cannot be read or has no frame."""
     with usable(file, "a telemetry log"):
         data = file.read_bytes()
     log = parse_tlog(data)
@@ -74,7 +74,7 @@ def parse_tlog(data: bytes) -> TelemetryLog:
 
 
 def _good_within(data: bytes, start: int, stop: int) -> bool:
-    """Whether a good frame begins within a stretch; if so, the frame that seemed to span it has a damaged length."""
+    """Whether a good frame begins in a range of bytes; if so, the frame that seemed to span it has a damaged length."""
     for magic in _MAGIC.finditer(data, start, stop):
         end = mavlink.frame_end(data, magic.start())
         if end and mavlink.decode_either(data[magic.start() : end], Counter()):
@@ -83,7 +83,7 @@ def _good_within(data: bytes, start: int, stop: int) -> bool:
 
 
 def _plausible(stamps_us: list[int]) -> list[bool]:
-    """Which stamps are possible times, and near the median of themselves and their two neighbours."""
+    """For each stamp, whether it is a possible time and near the median of itself and its two neighbours."""
     possible = [us < LATEST_NS // 1000 for us in stamps_us]
     if len(stamps_us) < 3:
         return possible
