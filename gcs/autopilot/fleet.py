@@ -1,4 +1,4 @@
-"""Vehicles with autopilots: their start, one common frame, identification, set-points."""
+"""A fleet of vehicles with autopilots: start-up, one common frame, identification, set-points."""
 
 from math import hypot
 
@@ -21,14 +21,14 @@ from scenarios.schema import NS_PER_S
 
 _UNANNOUNCED_S = 3.0
 _LEAD_S = 0.5
-"""The velocity target leads the vehicle's newest velocity by at most what its largest acceleration gains in this time
-plus the age of that velocity plus the delay down. More would only build up while the vehicle cannot follow."""
+"""The velocity target leads the vehicle's newest velocity by at most the gain in velocity at its largest acceleration
+over the sum of this time, the age of that velocity and the delay down. More would wind up while it cannot follow."""
 _FRAME_RESOLUTION_M = 0.005
-"""Half of the last digit of a latitude: an origin that seems to move by less has not moved."""
+"""Half of the last digit of a latitude: an origin that moves by less is considered unchanged."""
 
 
 class AutopilotFleet(Fleet):
-    """Multicopters that start on the ground, each in a frame of its own."""
+    """Multicopters that start on the ground, each with its own local frame."""
 
     speaks_mavlink_1_first = True
     holds_when_left_alone = False
@@ -46,7 +46,7 @@ class AutopilotFleet(Fleet):
         super().__init__(plan, report, starts=self.starts)
         self._report = report
         self._lacks = [("", 0)] * len(self.vehicles)
-        """What each vehicle lacks, and since when; 0 once that has been reported."""
+        """What each vehicle lacks, and since when; the time is 0 once that has been reported."""
         self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
         self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
@@ -78,7 +78,7 @@ class AutopilotFleet(Fleet):
         return ""
 
     def _leave_out(self, vehicles: list[RemoteVehicle], history: StateHistory) -> None:
-        """Fly without vehicles; from now on they are commanded nothing, until the flight ends."""
+        """Fly without some vehicles. From now on they get no commands until the flight ends."""
         for vehicle in vehicles:
             vehicle.left_out, vehicle.goal = True, None
             history.forget(self.vehicles.index(vehicle))
@@ -90,11 +90,11 @@ class AutopilotFleet(Fleet):
             self._identification = Identification(self.plan, present, self._report)
 
     def _report_lacks(self, due_ns: int) -> None:
-        """Report what a vehicle has lacked for longer than a start-up step usually takes."""
+        """Report anything that a vehicle has lacked for longer than a start-up step usually takes."""
         for row, vehicle in enumerate(self.vehicles):
             if vehicle.left_out:
                 continue
-            lacks, _, _ = vehicle.missing.partition(",")  # without how far it has climbed
+            lacks, _, _ = vehicle.missing.partition(",")  # drops the altitude reached, which changes all the time
             before, since_ns = self._lacks[row]
             if lacks != before:
                 self._lacks[row] = lacks, due_ns
@@ -107,7 +107,7 @@ class AutopilotFleet(Fleet):
             self._report("limits", startup.limits.in_words(), vehicle.system_id)
 
     def locate(self, history: StateHistory) -> None:
-        """States reported in a frame that has moved since are forgotten."""
+        """Update the origins of the local frames. States reported before their frame moved are dropped."""
         first = next(start for start, vehicle in zip(self.starts, self.vehicles, strict=True) if not vehicle.left_out)
         for row, startup in enumerate(self.starts):
             if first.origin is None or startup.origin is None:
@@ -171,7 +171,7 @@ class AutopilotFleet(Fleet):
             self._rest(row)
             return None
         if not vehicle.guided:
-            self._rest(row)  # set-points show it that a station is there; they start from its own velocity
+            self._rest(row)  # set-points only show it that a station is there; each starts from its own velocity
         self.loop.remember(row, due_ns, command)
         late_s = (due_ns - sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if sample_ns else 0.0
         lead_m_s = self._bounds.acceleration_m_s2(row) * (late_s + _LEAD_S)

@@ -1,17 +1,17 @@
 """Identifies a vehicle's response to set-points from a short manoeuvre before the formation flight.
 
 All vehicles are commanded the same acceleration at the same time, so they keep their distances: two periods of a sine
-of 2.1 rad/s, near the frequency at which loops with such vehicles become unstable, and its third harmonic. The velocity
-ends as it began, some metres to one side. The jerk stays well below what autopilots allow: a square measures their jerk
-limit instead of their response. A sine that is reversed half-way would hold nothing at its own frequency.
+of 2.1 rad/s, near the frequency at which loops with such vehicles become unstable, plus its third harmonic. The vehicle
+ends with its initial velocity, displaced by some metres. The jerk stays well below the autopilots' limit: a square wave
+would measure that limit instead of the response. A sine reversed half-way would have no energy at its own frequency.
 
-They do so at the velocity of the formation, because the air resists. At 1.9 rad/s an ArduCopter in SITL answers with
-1.09 of a command at rest, at 4 m/s with 0.98 along its way and 1.02 across it. Five of them became unstable at 506 ms
-of loop delay at rest, and at about 565 ms at 4 m/s. Across the way the margin is the smaller one.
+The manoeuvre is flown at the formation's velocity, because air resistance matters. At 1.9 rad/s, an ArduCopter in SITL
+responds with a gain of 1.09 at rest; at 4 m/s the gain is 0.98 along track and 1.02 across track. Five of them became
+unstable at 506 ms of loop delay at rest, and at about 565 ms at 4 m/s. Across track, the margin is the smaller one.
 
-The models of `gains.performance.response` are fitted to the velocity that a vehicle reports, and the Bayesian
-information criterion chooses between them. A command acts at its sending time plus the measured delay down; the instant
-of a sample comes from the vehicle's clock. So the response found does not include the link's delay.
+The models of `gains.performance.response` are fitted to the velocity that a vehicle reports; the Bayesian information
+criterion selects one. A command is taken to act at its send time plus the measured delay down, and samples are timed by
+the vehicle's clock. So the identified response does not include the link delay.
 """
 
 from collections.abc import Generator, Mapping
@@ -26,21 +26,21 @@ from gains.performance.response import Response, own_dynamics
 
 LONGEST_S = 6.0
 _OMEGA_RAD_S, _HARMONIC, _SHARE = 2.0 * pi / 3.0, 3, 0.15
-"""The sine, and a harmonic with this share of its amplitude, which tells the models apart."""
+"""The sine, and a harmonic with this fraction of its amplitude, which distinguishes the models."""
 _JERK_M_S3 = 2.5
 _RUN_UP_M_S2, _SETTLED_S, _SLIGHT_M_S = 1.5, 3.0, 0.2
-"""Largest acceleration of a run-up, how long the velocity then settles, and a change of velocity that needs none."""
+"""Maximum acceleration of a run-up, settling time after it, and the change of velocity below which none is flown."""
 MISFIT_MAX = 0.1
 """A fit that leaves more than this fraction of the velocity unexplained is refused."""
 LEAST_RATE_HZ = 10.0
 _FEWEST_SAMPLES = 42
-"""Of the sixty at 10 Hz, so that some may be lost."""
+"""At 10 Hz the manoeuvre gives sixty samples, some of which may be lost."""
 _BOUNDS = np.log([(0.01, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
-"""Lag, velocity gain, dead time, natural frequency."""
+"""Bounds of lag, velocity gain, dead time and natural frequency, as logarithms."""
 _USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
 _STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2
 _RESOLUTION = 1e-3
-"""Misfits that differ by less than this fraction of the velocity do not tell models apart."""
+"""Misfits that differ by less than this fraction of the velocity do not distinguish models."""
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ class Identified:
     misfit: float
     samples: int
     misfits: Mapping[str, float]
-    """The same of every model, by its name."""
+    """The misfit of every model, by name."""
 
 
 def amplitude_m_s2(acceleration_max_m_s2: float | None) -> float:
-    """Amplitude of the manoeuvre's sine: within half of the limit, as the velocity loop adds to it."""
+    """Amplitude of the manoeuvre's sine, at most half of the limit because the velocity loop adds to it."""
     return min(_JERK_M_S3 / (_OMEGA_RAD_S * (1.0 + _HARMONIC * _SHARE)), 0.5 * (acceleration_max_m_s2 or inf))
 
 
@@ -69,7 +69,7 @@ def manoeuvre_m_s2(since_s: float, amplitude: float) -> float:
 
 @dataclass(frozen=True)
 class RunUp:
-    """A half sine of acceleration that changes the velocity by `gain_ne_m_s`, and a while without acceleration."""
+    """A half sine of acceleration that changes the velocity by `gain_ne_m_s`, followed by a settling time."""
 
     gain_ne_m_s: tuple[float, float]
     sine_s: float
@@ -88,7 +88,7 @@ class RunUp:
 
 
 def run_up(gain_ne_m_s: tuple[float, float], acceleration_max_m_s2: float | None) -> RunUp:
-    """The run-up within half of the limit of acceleration; none for a slight change of velocity."""
+    """The run-up, within half of the acceleration limit; an empty one for a slight change of velocity."""
     gain_m_s = hypot(*gain_ne_m_s)
     if gain_m_s < _SLIGHT_M_S:
         return RunUp((0.0, 0.0), 0.0)
@@ -98,21 +98,21 @@ def run_up(gain_ne_m_s: tuple[float, float], acceleration_max_m_s2: float | None
 
 @dataclass(frozen=True)
 class Flown:
-    """What a vehicle was commanded in the manoeuvre, and the velocities it reported."""
+    """A vehicle's commands in the manoeuvre, and the velocities it reported."""
 
     period_s: float
     command_m_s2: FloatArray
-    """Acceleration (m,) from one control tick to the next."""
+    """Acceleration (m,), constant from one control tick to the next."""
     sample_s: FloatArray
-    """Instants (n,) of the samples after the first command acted, from 0 to m periods."""
+    """Instants (n,) of the samples, relative to when the first command acted, from 0 to m periods."""
     velocity_m_s: FloatArray
     """In the direction of the manoeuvre. Its mean, such as a drift, is ignored."""
 
     def velocities(self, responses: list[Response]) -> FloatArray:
-        """The velocity at each sample of vehicles with each of these responses of one model, shape (k, n).
+        """The modelled velocity at each sample, for each of k responses of one model, shape (k, n).
 
-        At the ticks, acceleration and velocity are the commands convolved with the response to the command of one tick;
-        between ticks the velocity is a cubic. Squaring the matrix of one tick gives that response at all ticks.
+        At the ticks, acceleration and velocity are the commands convolved with the response to a one-tick command;
+        between ticks the velocity is a cubic. Repeatedly squaring the one-tick matrix gives that response at all ticks.
         """
         m, h = self.command_m_s2.size, self.period_s
         dynamics = [own_dynamics(response) for response in responses]
@@ -141,7 +141,7 @@ class Flown:
 
 
 def identify(flown: Flown) -> Generator[None, None, Identified | None]:
-    """The least-squares fit of the model that explains the velocities best, in steps of some milliseconds.
+    """The least-squares fit of the selected model, computed in steps of a few milliseconds.
 
     None if there are too few samples, or no motion.
     """
@@ -166,7 +166,7 @@ def identify(flown: Flown) -> Generator[None, None, Identified | None]:
 
 
 def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
-    """The model with the least information criterion; correlated residuals count as fewer samples."""
+    """The model with the smallest information criterion; correlated residuals count as fewer samples."""
     n = residuals.size
     alike = float(residuals[1:] @ residuals[:-1]) / max(float(residuals @ residuals), 1e-300)
     count = max(10.0, n * (1.0 - alike) / (1.0 + alike)) if alike > 0.0 else float(n)
@@ -184,13 +184,13 @@ def _response(name: str, logs: FloatArray) -> Response:
 
 
 def _misfit(flown: Flown, name: str, logs: FloatArray) -> FloatArray:
-    """Modelled less measured velocity, both without their means, for each row of parameters."""
+    """Modelled minus measured velocity, both without their means, for each row of parameters."""
     velocity = flown.velocities([_response(name, row) for row in logs]) - flown.velocity_m_s
     return velocity - velocity.mean(axis=1, keepdims=True)
 
 
 def _descent(flown: Flown, name: str, start: FloatArray) -> Generator[None, None, tuple[FloatArray, FloatArray]]:
-    """Levenberg-Marquardt descent to parameters and residuals, a few steps at a time."""
+    """Levenberg-Marquardt fit of a model, a few steps at a time; returns parameters and residuals."""
     used, x, damping = _USED[name], start.copy(), 1e-3
     nudges = _NUDGE * np.eye(x.size)[used]
     rest = np.empty(0)

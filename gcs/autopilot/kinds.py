@@ -13,13 +13,13 @@ from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, Kind, Ste
 ARM = ARM_DISARM, (1.0,)
 STAYS_DISARMED = "has landed and is not armed again"
 ARDUPILOT, PX4 = 3, 12
-"""MAV_AUTOPILOT"""
+"""Values of MAV_AUTOPILOT."""
 _MULTICOPTERS = {2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"}
 _NOT_YET_KNOWN, _FIXED_WING = 0, 1
 
 _POSITION_FLAGS, _CONSTANT_POSITION = 0x08 | 0x10, 0x80
-"""Estimator flags: horizontal position, relative and absolute; a position that is only assumed. The bits are the same
-in EKF_STATUS_REPORT and ESTIMATOR_STATUS."""
+"""Estimator flags: horizontal position known, relative and absolute; position only assumed. The bits are the same in
+EKF_STATUS_REPORT and ESTIMATOR_STATUS."""
 ARDUCOPTER = Kind(
     "ArduCopter",
     guided_mode=4,
@@ -28,7 +28,7 @@ ARDUCOPTER = Kind(
     estimator_message=mavlink.EKF_STATUS_REPORT,
     stays_guided=True,
     velocity_grows=True,
-    timesync_error_ns=5_000_000,  # backdated by the bytes' time on a serial port, 3.5 ms at 57600 baud
+    timesync_error_ns=5_000_000,  # stamps are backdated by the transfer time on a serial port, 3.5 ms at 57600 baud
 )
 PX4_COPTER = Kind(
     "PX4 multicopter",
@@ -45,7 +45,7 @@ PX4_COPTER = Kind(
 
 
 def kind_of(autopilot: int, vehicle_type: int) -> Kind | str | None:
-    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None while it does not know yet."""
+    """The kind of vehicle that a HEARTBEAT reports, or why it cannot be flown; None while the vehicle does not know."""
     if vehicle_type == _NOT_YET_KNOWN:
         return None  # ArduPilot before its motors are set up
     if vehicle_type == _FIXED_WING and autopilot == ARDUPILOT:
@@ -59,10 +59,10 @@ def kind_of(autopilot: int, vehicle_type: int) -> Kind | str | None:
 
 
 class Seen(NamedTuple):
-    """What is known of a vehicle during its start-up."""
+    """Observed state of a vehicle during its start-up."""
 
     interval_due: tuple[float, float] | None
-    """The next message (id, interval in µs) whose rate it has not accepted yet; None if it has accepted all."""
+    """The next message (id, interval in µs) whose rate the vehicle has not yet accepted; None if all are accepted."""
     clock_known: bool
     position_heard: bool
     estimator_flags: int | None
@@ -70,7 +70,7 @@ class Seen(NamedTuple):
     custom_mode: int
     armed: bool
     has_landed: bool
-    """It has been in the air in this flight and is on the ground again."""
+    """It has been in the air in this flight and is back on the ground."""
     took_off: bool
     airborne: bool
     relative_altitude_m: float | None
@@ -79,10 +79,10 @@ class Seen(NamedTuple):
 
 
 def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
-    """The next step of the start-up, from what is seen alone: a vehicle found in the air continues from there.
+    """The next step of the start-up. It depends on `seen` alone, so a vehicle found in the air continues from there.
 
     All need rates, clock and position. ArduCopter then becomes guided, is armed and takes off; PX4 is armed, takes off
-    and becomes guided (OFFBOARD) once set-points arrive. A vehicle that has landed is sent neither mode nor arming.
+    and becomes guided (OFFBOARD) once set-points arrive. A vehicle that has landed gets no mode or arming command.
     """
     if seen.interval_due is not None:
         text = f"does not accept the rate of message {seen.interval_due[0]:.0f}"
@@ -95,7 +95,7 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
     if not seen.armed:
         return Step("does not arm", ARM)
     if not seen.took_off and not seen.airborne:
-        # PX4 would fly to a latitude, longitude and yaw that are numbers; NaN means where it stands.
+        # PX4 would fly to a finite latitude, longitude and yaw; NaN keeps the present ones.
         where = (0.0, 0.0, 0.0, nan, nan, nan, altitude_m + seen.sea_level_m)
         return Step("does not take off", (TAKE_OFF, where if kind.altitude_above_sea else (0.0,) * 6 + (altitude_m,)))
     climbs = f"climbs to {altitude_m:g} m, is at {seen.relative_altitude_m or 0.0:.1f} m"
@@ -103,7 +103,7 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
 
 
 def _lacks(kind: Kind, seen: Seen) -> str:
-    """What the vehicle lacks that no command can bring."""
+    """What the vehicle lacks that no command can provide; empty if nothing."""
     flags = seen.estimator_flags
     if seen.has_landed or not seen.clock_known:
         return STAYS_DISARMED if seen.has_landed else "does not answer TIMESYNC"

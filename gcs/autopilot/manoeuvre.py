@@ -1,4 +1,4 @@
-"""The identification manoeuvre of all vehicles, tick by tick, and the flight plan with the responses found."""
+"""Flies the identification manoeuvre tick by tick, and makes the flight plan with the identified responses."""
 
 from collections.abc import Iterator, Sequence
 from math import hypot
@@ -14,7 +14,7 @@ from gcs.plan.flight_plan import FlightPlan, Responses, margin_steps
 from scenarios.schema import NS_PER_S
 
 _UNNOTICED_NS = NS_PER_S
-"""A clock jump is noticed within this time; samples since then have wrong instants."""
+"""A clock jump is detected within this time: samples this recent have wrong instants."""
 
 
 class _Sample(NamedTuple):
@@ -27,9 +27,9 @@ class _Sample(NamedTuple):
 class Identification:
     """Collects the vehicles' velocities during the manoeuvre, then computes the result in steps, one per tick.
 
-    The vehicles are first brought to the velocity at which the formation flight begins. The manoeuvre is across it, or
-    north at rest. One that a vehicle did not follow is flown once more: a gust may have passed, or a simulator have
-    stalled.
+    The vehicles are first brought to the velocity at which the formation flight begins. The manoeuvre is perpendicular
+    to it, or north at rest. If a vehicle did not follow it, the manoeuvre is flown once more: a gust may have passed,
+    or a simulator stalled.
     """
 
     def __init__(self, plan: FlightPlan, vehicles: Sequence[RemoteVehicle], report: Report) -> None:
@@ -42,7 +42,7 @@ class Identification:
         speed_m_s = hypot(north, east)
         self._direction_ne = (-east / speed_m_s, north / speed_m_s) if speed_m_s > 0.0 else (1.0, 0.0)
         self._run_up: tuple[int, RunUp] | None = None
-        """When the run-up began (ns), and what it is."""
+        """The start time (ns) of the run-up, and the run-up."""
         self._is_repeated = False
         self._begin()
 
@@ -51,13 +51,13 @@ class Identification:
         self._commands: list[tuple[int, float]] = []
         """Instant (ns) and acceleration (m/s²) of each command in the direction of the manoeuvre."""
         self._downs_ns: list[list[int]] = [[] for _ in self._vehicles]
-        """How long commands took to each vehicle."""
+        """The delay down of each command to each vehicle."""
         self._samples: list[list[_Sample]] = [[] for _ in self._vehicles]
         self._jumps = [vehicle.clock.jumps for vehicle in self._vehicles]
         self._steps = self._result()
 
     def command(self, due_ns: int) -> tuple[float, float]:
-        """The acceleration that all vehicles are commanded at a tick, which it notes."""
+        """The acceleration commanded to all vehicles at a tick; it is recorded."""
         if self._run_up is None:
             return 0.0, 0.0
         began_ns, run_up = self._run_up
@@ -75,7 +75,7 @@ class Identification:
         return command * north, command * east
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
-        """The plan with the margins of the responses found, or why there is none; None while it takes longer."""
+        """The plan with the margins of the identified responses, or why there is none; None while still at work."""
         gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.has_landed), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"
@@ -87,7 +87,7 @@ class Identification:
         return next(self._steps)
 
     def _run_up_from(self, history: StateHistory) -> RunUp:
-        """From the vehicles' mean velocity to the nominal one; a leader that somebody else flies sets no velocity."""
+        """The run-up from the mean velocity to the nominal one; none behind a leader that somebody else flies."""
         scenario = self._plan.scenario
         states = [newest[1] for row in range(len(self._vehicles)) if (newest := history.newest(row))]
         if scenario.external_id is not None or not states:
@@ -96,7 +96,7 @@ class Identification:
         return identify.run_up((float(north), float(east)), self._limit_m_s2)
 
     def _result(self) -> Iterator[FlightPlan | str | None]:
-        """The result, after a None for each step before it."""
+        """Yields None for each step of the computation, then the result."""
         found: dict[int, Identified] = {}
         for row, vehicle in enumerate(self._vehicles):
             seen = yield from identify.identify(self._flown(row))
@@ -142,7 +142,7 @@ class Identification:
                 samples.append(_Sample(newest[0], due_ns, north * v_north + east * v_east))
 
     def _flown(self, row: int) -> Flown:
-        """The manoeuvre as one vehicle saw it, on the grid of control ticks; a missed tick repeats the one before."""
+        """The manoeuvre as flown by one vehicle, on the grid of control ticks; missed ticks repeat the previous one."""
         begin_ns, period_s = self._begin_ns or 0, 1.0 / self._plan.scenario.rates.control_hz
         sent_s = (np.array([at_ns for at_ns, _ in self._commands], dtype=np.int64) - begin_ns) / NS_PER_S
         ticks = np.arange(round(float(sent_s[-1]) / period_s) + 1)
@@ -157,7 +157,7 @@ class Identification:
 
 
 def in_words(found: Identified) -> str:
-    """The response of a vehicle, its misfit and that of the other models."""
+    """Describes the response of a vehicle, its misfit and that of the other models."""
     response = found.response
     late = f", dead time {response.dead_time_s:.3f} s" if response.dead_time_s else ""
     if response.natural_frequency_rad_s is not None:

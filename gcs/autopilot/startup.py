@@ -1,7 +1,7 @@
 """Start-up of one vehicle with an autopilot: its kind, estimator, rates, take-off and the origin of its local frame.
 
-The origin's place on the globe comes from GPS_GLOBAL_ORIGIN, from HOME_POSITION, which gives the home in both frames,
-or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
+The origin's latitude and longitude come from GPS_GLOBAL_ORIGIN; from HOME_POSITION, which gives the home position in
+both frames; or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
 """
 
 from math import cos, degrees, isfinite, radians
@@ -19,16 +19,16 @@ _SLOW_US = 200_000.0
 _TAKEN_OFF_FRACTION = 0.95
 """A take-off is complete at this fraction of the commanded altitude."""
 _TAKE_OFF_S, _SLOWEST_CLIMB_M_S = 15.0, 0.5
-"""A take-off may last this long plus the climb at this rate. Then it is commanded again or, if the vehicle has left the
-ground, set-points lead it to its altitude."""
+"""Timeout of a take-off: this long plus the climb at this rate. Then it is commanded again or, if the vehicle has left
+the ground, set-points lead it to its altitude."""
 _LEFT_GROUND_M = 2.0
 _STANDBY = 3
-"""MAV_STATE of a vehicle on the ground, ArduCopter's also while it is armed."""
+"""MAV_STATE of a vehicle on the ground; ArduCopter reports it there even while armed."""
 _OLD_MS = 1000
-"""A reported altitude older than this is carried on with the height of the local frame."""
+"""Age beyond which a reported altitude is extended with the height in the local frame."""
 _HAS_FLOWN_M, _FLIES_M = 1.0, 2.0
-"""An armed vehicle above the first has flown; one that has landed flies again above the second, farther from the drift
-of a barometer."""
+"""An armed vehicle above the first altitude has flown. One that has landed flies again above the second, which leaves
+more room for barometer drift."""
 
 Degrees = tuple[float, float]
 """Latitude and longitude."""
@@ -37,8 +37,8 @@ Degrees = tuple[float, float]
 class AutopilotStartup(Startup):
     """Start-up of one vehicle, which takes off to `altitude_m`.
 
-    It never arms a vehicle that has been in the air and is on the ground again: people may be beside it. The pilot may
-    take it off again.
+    A vehicle that has been in the air and is back on the ground is never armed again: people may be near it. The pilot
+    may take off again.
     """
 
     def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
@@ -48,11 +48,11 @@ class AutopilotStartup(Startup):
         self.airborne = False
         self.origin: Degrees | None = None
         self.origin_altitude_m = 0.0
-        """Above sea level; only with an origin."""
+        """Above sea level; valid only once the origin is known."""
         self.limits = ToldLimits()
         self._armed = self._standby = self._has_flown = False
         self._text = ""
-        """What it said last."""
+        """The last text received; cleared by armed heartbeats."""
         self._origin_said = False
         self._sea_level_m = 0.0
         self._flags: int | None = None
@@ -113,7 +113,7 @@ class AutopilotStartup(Startup):
         self._judge_ground()
 
     def _judge_ground(self) -> None:
-        """Judge from the newest heartbeat and altitude whether it has taken off or landed."""
+        """Decide from the newest heartbeat and altitude whether the vehicle has taken off or landed."""
         above_home_m = self.relative_altitude_m or 0.0
         self._has_flown |= self._armed and above_home_m > _HAS_FLOWN_M
         if not self._armed or self._standby:
@@ -151,9 +151,9 @@ class AutopilotStartup(Startup):
             self._took_off_ns = now_ns
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """A message rate for the origin may be refused: other messages show it too. So may that of the active target.
+        """Accept a refused rate of the origin, which other messages contain too, or of the optional active target.
 
-        Refusals to arm are counted. A vehicle that refuses a repeated take-off is taking off already, and its first
+        Refusals to arm are counted. A vehicle that refuses a resent take-off command is already taking off: its first
         answer was lost.
         """
         if command == SET_MESSAGE_INTERVAL and parameters[0] in (mavlink.GPS_GLOBAL_ORIGIN, OPTIONAL):
@@ -164,7 +164,7 @@ class AutopilotStartup(Startup):
             self._took_off_ns = now_ns
 
     def is_news(self, text: str) -> bool:
-        """While it is disarmed, it repeats why it does not arm."""
+        """Whether a text is new: a disarmed vehicle keeps repeating why it does not arm."""
         known, self._text = not self._armed and text == self._text, text
         return not known
 
@@ -177,7 +177,7 @@ class AutopilotStartup(Startup):
         self._took_off_ns = None
 
     def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """The question that is due about its limits; to set them is its owner's."""
+        """The request that is due for its limits, which are only read: setting them is up to the owner."""
         return self.limits.next(self.kind, now_ns, target_system=target_system, rtt_ns=rtt_ns)
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
@@ -186,7 +186,7 @@ class AutopilotStartup(Startup):
         due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
         patience_ns = (_TAKE_OFF_S + self.altitude_m / _SLOWEST_CLIMB_M_S) * 1e9
         took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
-        # A vehicle found in the air takes set-points at once; during a take-off they would end the climb too early.
+        # A vehicle found in the air takes set-points at once; during a take-off, they would end the climb too early.
         enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if took_off else _LEFT_GROUND_M
         is_up = self.airborne or (self.relative_altitude_m or 0.0) > enough_m
         self.airborne = armed and is_up and not self.has_landed
@@ -212,7 +212,7 @@ class AutopilotStartup(Startup):
 
 
 def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:
-    """The place that lies so far north and east of another, on a flat earth."""
+    """The position `north_m` and `east_m` from another, on a flat earth."""
     latitude, longitude = place
     return (
         latitude + degrees(north_m / EARTH_RADIUS_M),
@@ -221,6 +221,6 @@ def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:
 
 
 def between(start: Degrees, end: Degrees) -> tuple[float, float]:
-    """How far `end` lies north and east of `start` in m, on a flat earth."""
+    """The displacement north and east from `start` to `end` in m, on a flat earth."""
     north = radians(end[0] - start[0]) * EARTH_RADIUS_M
     return north, radians(end[1] - start[1]) * EARTH_RADIUS_M * cos(radians(start[0]))

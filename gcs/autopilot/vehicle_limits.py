@@ -1,7 +1,7 @@
-"""The most that an autopilot follows: read from its parameters, and kept to by the commands it is sent.
+"""The limits of an autopilot, read from its parameters, within which its commands are kept.
 
-A command beyond these limits is not followed. The loop then closed is not the one whose margin is known: it cycles or
-overshoots. A vehicle far from its place is therefore led along a braking curve instead of by the linear law.
+A command beyond these limits is not followed. The loop is then no longer the one whose margin is known: it limit-cycles
+or overshoots. A vehicle far from its place is therefore led along a braking curve instead of by the linear law.
 """
 
 from collections.abc import Sequence
@@ -16,33 +16,33 @@ from scenarios.kernel import Records
 from scenarios.schema import NS_PER_S
 
 ACCELERATION_M_S2, JERK_M_S3 = 2.0, 4.0
-"""Bounds for a vehicle that does not tell its own."""
+"""Bounds for a vehicle that does not report its own limits."""
 _ACCELERATION_SHARE, _JERK_SHARE = 0.9, 0.8
-"""Of the limits it tells: the velocity loop adds to what is commanded."""
+"""Usable fractions of the reported limits: the velocity loop adds to the command."""
 _BRAKING_SHARE = 0.3
-"""Of the acceleration, for which the braking curve is drawn: the jerk limit and the response take the rest."""
+"""Fraction of the acceleration limit assumed by the braking curve: the jerk limit and the response take the rest."""
 _PARAMETERS = {
     ARDUCOPTER.name: (("WPNAV_ACCEL", 0.01), ("PSC_JERK_XY", 1.0), ("GUID_TIMEOUT", 1.0)),
     PX4_COPTER.name: (("MPC_ACC_HOR", 1.0), ("MPC_JERK_AUTO", 1.0), ("COM_OF_LOSS_T", 1.0)),
 }
-"""Acceleration, jerk and set-point time-out of each kind, and their units in m/s^2, m/s^3 and s."""
+"""Parameters of each kind for acceleration, jerk and set-point timeout, with their units in m/s^2, m/s^3 and s."""
 _LEAST, _LARGEST = 0.1, 100.0
-"""A value outside of these, in those units, is not taken for a limit."""
+"""Range of plausible limits in those units; a value outside is ignored."""
 _ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
 
 
 class ToldLimits:
-    """The limits that one vehicle tells."""
+    """The limits that one vehicle reports."""
 
     def __init__(self) -> None:
         self._told: list[float | None] = [None] * 3
-        """Acceleration, jerk and set-point time-out; None while, or if, it does not tell them."""
+        """Acceleration, jerk and set-point timeout; None while not reported."""
         self._kind = ""
         self._asked: dict[str, int] = {}
         self._not_before_ns = 0
 
     def next(self, kind: Kind, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """Message id and fields of the question that is due, if any: a few for each parameter, one at a time."""
+        """Message id and fields of the request that is due, if any: one at a time, `_ATTEMPTS` for each parameter."""
         if now_ns < self._not_before_ns or kind.name not in _PARAMETERS:
             return None
         self._kind = kind.name
@@ -54,7 +54,7 @@ class ToldLimits:
         return None
 
     def take(self, fields: tuple[Any, ...]) -> None:
-        """Take in a PARAM_VALUE; a value that no vehicle can mean is ignored."""
+        """Process a PARAM_VALUE; an implausible value is ignored."""
         value, _, _, field, _ = fields
         name = field.partition(b"\0")[0].decode("ascii", "replace")
         if name not in self._asked:
@@ -71,7 +71,7 @@ class ToldLimits:
 
     @property
     def jerk_bound_m_s3(self) -> float:
-        """How fast that acceleration may change."""
+        """The largest rate of change of the acceleration."""
         told = self._told[1]
         return JERK_M_S3 if told is None else _JERK_SHARE * told
 
@@ -88,7 +88,7 @@ class ToldLimits:
 
 
 class Bounds:
-    """Keeps the commands of a formation to what each vehicle follows."""
+    """Keeps the commands of a formation within the limits of each vehicle."""
 
     def __init__(self, plan: FlightPlan, limits: Sequence[ToldLimits]) -> None:
         self._limits = limits
@@ -97,19 +97,19 @@ class Bounds:
         self._gains = [own_gains(plan, K) for K in plan.gains]
         self._last = [(0.0, 0.0)] * len(limits)
         self._approaches = [True] * len(limits)
-        """Whether a vehicle is on its way to its place. Once there it is left to the linear law: beyond its margin the
-        braking curve would turn growing errors into a limit cycle, which hides that the loop is unstable."""
+        """Whether a vehicle is still approaching its place. Once there, the linear law applies: beyond the margin, the
+        braking curve would turn growing errors into a limit cycle and hide that the loop is unstable."""
 
     def acceleration_m_s2(self, row: int) -> float:
-        """The largest acceleration that a vehicle is commanded."""
+        """The largest acceleration that may be commanded to a vehicle."""
         return min(self._most_m_s2, self._limits[row].acceleration_bound_m_s2)
 
     def rest(self, row: int) -> None:
-        """The vehicle is commanded nothing; its next command starts from zero."""
+        """Note that the vehicle gets no command; its next command starts from zero."""
         self._last[row], self._approaches[row] = (0.0, 0.0), True
 
     def bound(self, controls: Records, blends: Records) -> None:
-        """Keep the commands to the braking curve, and within the limits of acceleration and jerk."""
+        """Keep the commands on the braking curve and within the limits of acceleration and jerk."""
         flown = blends["flown"].tolist()
         both = zip(controls["command_m_s2"].tolist(), controls["spacing_error_m"].tolist(), strict=True)
         for row, (command, spacing_error) in enumerate(both):
@@ -134,7 +134,7 @@ class Bounds:
     def _braking(
         self, row: int, spacing_error_m: Sequence[float], flown: int, braking_m_s2: float
     ) -> tuple[float, float]:
-        """By how much the linear law commands too large an acceleration, far from the vehicle's place.
+        """The excess of the linear law's acceleration far from the vehicle's place, which is to be subtracted.
 
         Under the law an error e closes at the speed lambda e, lambda = k3 / k1. Beyond e_0 = b / lambda^2 that would
         need braking harder than b; the speed there is sqrt(2 b (e - e_0 / 2)) instead.

@@ -35,12 +35,12 @@ class VelocityTargets:
         self._period_s = period_s
 
     def hover(self, row: int) -> VelocitySetPoint:
-        """The set-point that keeps a vehicle where it is."""
+        """The set-point with which a vehicle hovers: no horizontal velocity."""
         self._targets[row] = None
         return self._with_climb(row, (0.0, 0.0), (0.0, 0.0))
 
     def rest(self, row: int) -> None:
-        """Send no set-point: the next one starts from the vehicle's velocity."""
+        """Note that no set-point is sent: the next one starts from the vehicle's velocity."""
         self._targets[row] = None
 
     def steers(self, row: int) -> bool:
@@ -49,10 +49,10 @@ class VelocityTargets:
     def accelerate(
         self, row: int, acceleration_m_s2: _Vector, velocity_m_s: _Vector, *, lead_m_s: float, now_ns: int
     ) -> VelocitySetPoint:
-        """The set-point of a commanded acceleration.
+        """The set-point for a commanded acceleration.
 
-        `velocity_m_s` is the vehicle's newest; it may be NaN if the vehicle has a velocity target, which keeps within
-        `lead_m_s` of it.
+        `velocity_m_s` is the vehicle's newest velocity; it may be NaN if the vehicle already has a velocity target. The
+        target is kept within `lead_m_s` of it.
         """
         target = self._targets[row]
         if target is None:
@@ -63,11 +63,11 @@ class VelocityTargets:
             east = target.velocity_m_s[1] + target.acceleration_m_s2[1] * since_s
             own_north, own_east = velocity_m_s
             ahead_m_s = hypot(north - own_north, east - own_east)
-            if ahead_m_s > lead_m_s:  # it cannot follow: more would only build up
+            if ahead_m_s > lead_m_s:  # it cannot follow: a larger lead would only wind up
                 share = lead_m_s / ahead_m_s
                 north, east = own_north + share * (north - own_north), own_east + share * (east - own_east)
         self._targets[row] = _Target((north, east), acceleration_m_s2, now_ns)
-        # A vehicle that holds the velocity between set-points is sent that of the middle of the period.
+        # A vehicle that holds the velocity between set-points is sent the velocity at the middle of the period.
         ahead_s = 0.0 if self._vehicles[row].kind.velocity_grows else self._period_s / 2.0
         sent = north + ahead_s * acceleration_m_s2[0], east + ahead_s * acceleration_m_s2[1]
         return self._with_climb(row, sent, acceleration_m_s2)

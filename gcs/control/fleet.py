@@ -1,6 +1,6 @@
-"""The vehicles of one flight, and all that depends on their kind: here double integrators, launched in the air.
+"""The vehicles of one flight and everything that depends on their kind: here double integrators, launched in the air.
 
-`gcs.autopilot.fleet` has multicopters with autopilots. Where the loop is closed is another choice, see
+`gcs.autopilot.fleet` has multicopters with autopilots. Where the loop is closed is a separate choice, made in
 `gcs.control.loops`.
 """
 
@@ -21,26 +21,26 @@ from scenarios.schema import NS_PER_S
 
 
 class Fleet:
-    """The vehicles of one flight, in the order of the formation: in the air from the beginning, in one frame.
+    """The vehicles of one flight, in formation order: in the air from the beginning, in one common frame.
 
     `report` takes events of vehicles as (kind, text, system id). `law` is the user's own control law, if it is flown.
-    `starts` is the start-up of each vehicle that is not in the air yet.
+    `starts` holds each vehicle's start-up if they begin on the ground.
     """
 
     speaks_mavlink_1_first = False
     """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
     holds_when_left_alone = True
-    """Whether a vehicle without set-points holds its velocity; the failsafe of an autopilot may be to fly on."""
+    """Whether a vehicle without set-points holds its velocity; an autopilot's failsafe may be to fly on."""
 
     def __init__(
         self, plan: FlightPlan, report: Report, law: FlownLaw | None = None, starts: Sequence[Startup] = ()
     ) -> None:
         scenario, ids = plan.scenario, plan.formation.system_ids
         self.plan = plan
-        """The flight plan; once the vehicles are identified, with margins for their responses."""
+        """The flight plan; after identification, with margins for the identified responses."""
         self.loop = loop_of(plan, law)
         self.is_usual = type(self.loop) is Loop and not starts
-        """Whether steps may be usual: see `gcs.station.usual`."""
+        """Whether steps may take the fast path of `gcs.station.usual`."""
         launched = (
             LaunchedStartup(scenario.rates.telemetry_hz, self.loop.parameters(key), target_hz=scenario.target_hz)
             for key in ids
@@ -68,33 +68,32 @@ class Fleet:
         return True
 
     def startup_failure(self, due_ns: int, start_ns: int, history: StateHistory) -> str:  # noqa: ARG002
-        """Why the flight cannot begin: a vehicle cannot be flown, or took too long. Empty while it still may begin.
+        """Why the flight cannot begin: a vehicle is refused, or took too long. Empty while it still may begin.
 
-        Vehicles that others can fly without are left out, and what they reported is forgotten.
+        A fleet that can fly without its late vehicles leaves them out and drops their reports from `history`.
         """
         late = [v for v in self.vehicles if not v.ready] if due_ns - start_ns > self._patience_ns else []
         return refusals(self.vehicles) or in_words("not ready: ", late)
 
     def begin(self) -> None:
-        """The vehicles are ready: report what is known of them."""
+        """Called when the vehicles are ready, to report what is known of them."""
 
     def end(self) -> None:
-        """The flight ends: report what was counted."""
+        """Called when the flight ends, to report what was counted."""
         if self._law is not None:
             self._law.report()
 
     def bound(self, controls: Records, blends: Records) -> None:
-        """Limit the commands of the control law to what the vehicles are known to follow: here all within the limits
-        of the scenario."""
+        """Limit the control law's commands to what the vehicles can follow; these follow all within scenario limits."""
 
     def locate(self, history: StateHistory) -> None:
-        """Update `frame_ned_m` as the origins of the vehicles' frames become known."""
+        """Update `frame_ned_m` once the origins of the vehicles' frames become known."""
 
     def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - their response is known
         """Advance the identification by one tick; returns why it failed, if it has."""
         return ""
 
     def set_points(self, orders: Orders, phase: Phase) -> Records:
-        """The set-points of this tick (n, SET_POINT), and which vehicles are sent one."""
-        del phase  # they take set-points in formation flight only
+        """The set-points of this tick (n, SET_POINT); `sent` marks the vehicles that get one."""
+        del phase  # these vehicles take set-points in formation flight only
         return self.loop.set_points(orders)

@@ -1,4 +1,4 @@
-"""The states that vehicles reported, kept long enough to bring any two of them to one instant."""
+"""Recent states reported by the vehicles, kept long enough to bring any two of them to one instant."""
 
 from collections.abc import Sequence
 from math import nan
@@ -23,20 +23,20 @@ _UNKNOWN = (nan, nan, nan, nan)
 
 
 class States(Protocol):
-    """Where vehicles are at any instant. Whoever inherits this needs `at` only."""
+    """States of vehicles at any instant. A subclass need only define `at`."""
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing."""
         ...
 
     def every_at(self, vehicles: NDArray[np.int64], times_ns: Instants) -> FloatArray:
-        """The states (m, 4) of m vehicles, each at an instant of its own; NaN where nothing was reported."""
+        """The states (m, 4) of m vehicles, each at its own instant; NaN where nothing was reported."""
         each = zip(vehicles.tolist(), times_ns.tolist(), strict=True)
         return np.array([self.at(vehicle, time_ns) or _UNKNOWN for vehicle, time_ns in each]).reshape(-1, 4)
 
 
 class Reports(States, Protocol):
-    """What vehicles reported, and where they are at any instant."""
+    """Newest reports of vehicles, and their states at any instant."""
 
     def newest(self, vehicle: int) -> Report | None:
         """The newest report of a vehicle; None if it has reported nothing."""
@@ -52,21 +52,21 @@ class StateHistory:
 
     def __init__(self, vehicles: int) -> None:
         self.reports: Records = np.zeros((vehicles, HISTORY), REPORT)
-        """The newest of each vehicle, in turn."""
+        """A ring buffer for each vehicle."""
         self.counts = np.zeros(vehicles, np.int64)
-        """How many reports each vehicle has made."""
+        """Number of reports accepted from each vehicle."""
         self._times_ns, self._states = memoryview(self.reports["time_ns"]), memoryview(self.reports["state"])
 
     def add(self, vehicle: int, time_ns: int, state: State) -> bool:
-        """Take in a report; returns False for one that is not newer than the newest, which is ignored."""
+        """Add a report; returns False if it is not newer than the newest, and ignores it."""
         return add_report(self.reports, self.counts, vehicle, time_ns, *state)
 
     def forget(self, vehicle: int) -> None:
-        """Drop what a vehicle reported, for example after its clock has jumped."""
+        """Drop a vehicle's reports, for example after its clock has jumped."""
         self.counts[vehicle] = 0
 
     def of(self, vehicles: Sequence[int]) -> "StateHistory":
-        """The same reports of some of the vehicles, whose rows count from 0 again."""
+        """A copy with only some of the vehicles, whose rows are renumbered from 0."""
         some = StateHistory(len(vehicles))
         some.reports[:], some.counts[:] = self.reports[[*vehicles]], self.counts[[*vehicles]]
         return some
@@ -112,17 +112,17 @@ def add_report(
 
 @kernel
 def state_at(reports: Records, counts: NDArray[np.int64], row: int, time_ns: int) -> State:
-    """The state of a vehicle at an instant, if it has reported any.
+    """The state at an instant of a vehicle that has reported at least one.
 
-    Between two reports the position is cubic through both positions and velocities, and the velocity linear; both are
-    exact for a constant acceleration. The cubic's slope is not used as velocity: it would contain errors of the
-    reports' instants, as when a clock estimate moves, and the rounding of positions. After the newest report and before
-    the oldest, the state is extrapolated with that report's velocity.
+    Between two reports, the position is a cubic through both positions and velocities, and the velocity is linear; both
+    are exact for a constant acceleration. The cubic's slope is not used as velocity: it would contain timing errors of
+    the reports, as when a clock estimate moves, and the rounding of positions. After the newest report and before the
+    oldest, the state is extrapolated with that report's velocity.
     """
     count = counts[row]
     after = reports[row, (count - 1) % HISTORY]
     if time_ns < after.time_ns:
-        for k in range(2, min(count, HISTORY) + 1):  # mostly one step or two
+        for k in range(2, min(count, HISTORY) + 1):  # usually one or two steps
             before = reports[row, (count - k) % HISTORY]
             if before.time_ns <= time_ns:
                 return _between(before.time_ns, before.state, after.time_ns, after.state, time_ns)
@@ -133,7 +133,7 @@ def state_at(reports: Records, counts: NDArray[np.int64], row: int, time_ns: int
 
 @kernel
 def _between(a_ns: int, a: FloatArray, b_ns: int, b: FloatArray, time_ns: int) -> State:
-    """Cubic Hermite interpolation of position, linear of velocity."""
+    """Cubic Hermite interpolation of position, linear interpolation of velocity."""
     span_s = (b_ns - a_ns) * 1e-9
     x = (time_ns - a_ns) * 1e-9 / span_s
     v0, v1, rise = a[2] * span_s, b[2] * span_s, b[0] - a[0]

@@ -1,11 +1,11 @@
 """The control law u = K e of the whole formation, computed from states reported at different instants.
 
-For the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs.
-2.10 and 3.25); any other gain matrix K is flown by the same code.
+In the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs.
+2.10 and 3.25); the same code flies any other gain matrix K.
 
-All errors in u_i are formed at one instant, that of vehicle i's newest state; the states of the others are brought to
-it. The loop around vehicle i is therefore delayed by vehicle i's own link only; a slow link ahead does not use up its
-margin.
+All errors in u_i are formed at one instant, that of vehicle i's newest state; the states of the others are interpolated
+or extrapolated to it. So only vehicle i's own link delays the loop around it: a slow link of a vehicle ahead does not
+use up its margin.
 """
 
 from collections.abc import Sequence
@@ -21,29 +21,29 @@ from gcs.plan.formation import Formation
 from scenarios.kernel import Array, Records, array_kernel
 
 LOST = -2
-"""In place of the vehicle ahead of a lost one."""
+"""Stands for the vehicle ahead in the row of a lost vehicle."""
 
 
 class FeedbackLaw(NamedTuple):
     """u_i = sum over its terms of G_ik (x_k - x*_k), x_k = (position, velocity), x*_k = (place in formation, v_d).
 
-    Positions are relative to the vehicle's own, so its own term has velocity only. The laws of n vehicles have m terms
-    in all, in the order of the vehicles; a lost vehicle has none. They are arrays for kernels.
+    Positions are relative to vehicle i, so its own term contains velocity only. The laws of n vehicles have m terms in
+    all, in vehicle order; a lost vehicle has none. All fields are arrays, for kernels.
     """
 
     begin: NDArray[np.int64]
-    """Place of each vehicle's first term, and m, (n + 1,)."""
+    """Index of each vehicle's first term, followed by m, (n + 1,)."""
     to: NDArray[np.int64]
     """The vehicle i that each term commands, (m,)."""
     source: NDArray[np.int64]
     """The vehicle k whose state it uses, (m,)."""
     offset_ne_m: FloatArray
-    """The wanted position of k relative to i, (m, 2)."""
+    """The desired position of k relative to i, (m, 2)."""
     gains: FloatArray
-    """The block G_ik (2, 4) of each set of the gain schedule, row by row: command (north, east) from position and
-    velocity (north, east), (m, sets, 8)."""
+    """The block G_ik (2, 4) of each set of the gain schedule, in row-major order: command (north, east) from position
+    and velocity (north, east), (m, sets, 8)."""
     ahead: NDArray[np.int64]
-    """The vehicle that spacing is kept to, one of the sources; -1 if there is none, LOST for a lost vehicle, (n,)."""
+    """The vehicle to which spacing is kept, one of the sources; -1 if there is none, LOST for a lost vehicle, (n,)."""
 
     @property
     def flown(self) -> NDArray[np.bool_]:
@@ -52,7 +52,7 @@ class FeedbackLaw(NamedTuple):
 
     @property
     def needed(self) -> NDArray[np.bool_]:
-        """Which terms have a gain other than zero, so that a command depends on their states, (m,)."""
+        """Which terms have a nonzero gain: a command depends on the states of these only, (m,)."""
         return np.logical_or.reduce(self.gains, axis=(1, 2))
 
 
@@ -63,10 +63,10 @@ def feedback_law(
 
     Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
 
-    The nearest remaining vehicle ahead stands in for a lost one: spacing is kept to it, at the sum of both offsets, and
-    its velocity error is used. Terms without a stand-in, and the spacing error of the lost vehicle, are omitted. A
-    vehicle with nobody left ahead keeps the nominal velocity, as the leader does. One that is `returning` to its place
-    flies its own law, while the others do without it, as if it were lost.
+    The nearest remaining vehicle ahead replaces a lost one: spacing is kept to it, at the sum of both offsets, and its
+    velocity error is used. Terms without a replacement, and the spacing error of the lost vehicle, are omitted. A
+    vehicle with nobody left ahead keeps the nominal velocity, as the leader does. A vehicle `returning` to its place
+    flies its own law, while the others treat it as lost.
     """
     model = formation.model
     without = [one or other for one, other in zip(lost, returning or lost, strict=True)]
@@ -106,7 +106,7 @@ def feedback_law(
 
 
 def _stand_ins(predecessors: Sequence[int], gone: Sequence[bool]) -> tuple[list[int], list[int]]:
-    """Which vehicle is flown with in place of each, and in place of the one in front of each; -1 for none."""
+    """The replacement of each vehicle (itself if not gone) and of the one in front of each; -1 for none."""
     stand_in: list[int] = []
     for row, ahead in enumerate(predecessors):
         stand_in.append(row if not gone[row] else stand_in[ahead] if ahead >= 0 else -1)
@@ -122,16 +122,16 @@ CONTROL = np.dtype(
         ("spacing_error_m", "f8", (2,)),
         ("velocity_error_m_s", "f8", (2,)),
         ("command_m_s2", "f8", (2,)),
-        ("used_ns", "i8"),  # instant of the errors from which the command was computed; on the ground `sample_ns`
+        ("used_ns", "i8"),  # instant of the errors behind the command; with the loop on the ground `sample_ns`
         ("assumed_s", "f8"),  # the loop delay over which the errors were predicted; 0 without prediction
-        ("acts_ns", "i8"),  # when the command is assumed to act, to which instant they were; 0 without prediction
+        ("acts_ns", "i8"),  # when the command is assumed to act: the errors are predicted to then; 0 without prediction
     ]
 )
 """State, errors and command of one vehicle, north and east; NaN where unknown or lost."""
 
 
 def unblended(vehicles: int) -> Records:
-    """Of BLEND: every vehicle flies the first set of gains."""
+    """An array of BLEND in which every vehicle flies the first set of gains."""
     blends = np.zeros(vehicles, BLEND)
     blends["share"] = 1.0
     return blends
@@ -147,8 +147,8 @@ def formation_control(
 ) -> Records:
     """Errors and commands of every vehicle (n, CONTROL) from the newest reported states.
 
-    `blends` holds the gains of each vehicle, `opening` is a factor on the formation's spacing. If a law needs an
-    unknown state its command is NaN and must not be sent. No limit is applied here.
+    `blends` holds the gains of each vehicle, `opening` is a factor on the formation's spacing. A command that depends
+    on an unknown state is NaN and must not be sent. No limit is applied here.
     """
     times_ns, states = history.every_newest()
     controls = np.empty(len(times_ns), CONTROL)
@@ -165,7 +165,7 @@ def commands_at(
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
 ) -> FloatArray:
-    """The command (n, 2) of each vehicle from the errors at an instant of its own."""
+    """The command (n, 2) of each vehicle, from the errors at its own instant."""
     own = states.every_at(np.arange(len(times_ns)), times_ns)
     seen, others = own[law.to], (law.source != law.to).nonzero()[0]
     seen[others] = states.every_at(law.source[others], times_ns[law.to[others]])
@@ -180,7 +180,7 @@ def commands_of(
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
 ) -> FloatArray:
-    """The same from the vehicles' own states (n, 4) and those that the terms of their laws use (m, 4)."""
+    """The command (n, 2) of each vehicle, from its own state (n, 4) and the states that the law's terms use (m, 4)."""
     controls = np.empty(len(own), CONTROL)
     control_all(controls, law, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
     return controls["command_m_s2"]
@@ -191,7 +191,7 @@ def control_all(
     controls: Records, law: FeedbackLaw, times_ns: Array, states: Array, seen: Array, blends: Records,
     nominal_north: float, nominal_east: float, opening: float,
 ) -> None:  # fmt: skip
-    """Fill in the controls: the command of each vehicle is the sum of G_ik (x_k - x*_k) over its terms."""
+    """Fill in `controls`: the command of each vehicle is the sum of G_ik (x_k - x*_k) over its terms."""
     g = np.empty(8)
     for row in range(len(controls)):
         control, state, flown = controls[row], states[row], law.ahead[row] != LOST
@@ -206,7 +206,7 @@ def control_all(
         for term in range(law.begin[row], law.begin[row + 1]):
             source = law.source[term]
             other = state if source == row else seen[term]
-            # Positions are relative to the vehicle's own: sums of large numbers would lose digits.
+            # Positions are relative to the vehicle's own: sums of large numbers would lose precision.
             x = other[0] - state[0] - opening * law.offset_ne_m[term, 0]
             y = other[1] - state[1] - opening * law.offset_ne_m[term, 1]
             v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
@@ -222,23 +222,23 @@ def control_all(
 
 
 class Nearest(NamedTuple):
-    """How near vehicles are to one another."""
+    """Distances to nearest neighbours."""
 
     distance_m: FloatArray
-    """Of each vehicle to the nearest other, (n,); NaN while unknown."""
+    """From each vehicle to its nearest neighbour, (n,); NaN while unknown."""
     two: tuple[int, int]
-    """The two that are nearest."""
+    """The closest pair."""
 
 
 _ROUNDED_UP = 1.0 + 1e-9
-"""A distance is not larger than this times one that is computed otherwise, whatever was rounded."""
+"""Allowance for rounding when two squared distances are compared."""
 
 
 @array_kernel
 def nearest(controls: Records, now_ns: int, down_m: Array) -> Nearest:
-    """The distances between vehicles, whose positions are brought to `now_ns` along the reported velocities.
+    """Distances to nearest neighbours, with positions extrapolated to `now_ns` along the reported velocities.
 
-    `down_m` holds the vehicles' positions down if they fly at different altitudes; if it is empty, distances are
+    `down_m` holds the vehicles' down positions if they fly at different altitudes; if it is empty, distances are
     horizontal.
     """
     n = len(controls)
@@ -247,8 +247,8 @@ def nearest(controls: Records, now_ns: int, down_m: Array) -> Nearest:
         state, age_s = controls[row].state, (now_ns - controls[row].sample_ns) * 1e-9
         north[row], east[row] = state[0] + state[2] * age_s, state[1] + state[3] * age_s
     least, one, two = inf, 0, 0
-    along = north if np.ptp(north) > np.ptp(east) else east  # sorted by this, those far away need no look
-    order = np.argsort(along, kind="mergesort")  # compiled in half the time of the default
+    along = north if np.ptp(north) > np.ptp(east) else east  # the sort axis: along it, distant vehicles are skipped
+    order = np.argsort(along, kind="mergesort")  # compiles in half the time of the default
     for place in range(n):
         row = order[place]
         for way in (-1, 1):

@@ -1,6 +1,6 @@
-"""Where the loop around each vehicle is closed, which decides what the station computes, uploads and sends.
+"""Ground loop and streamed loop: where the loop is closed decides what the station computes, uploads and sends.
 
-`gcs.control.manoeuvring.loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the
+`gcs.control.manoeuvring.loop_of` selects the loop; nothing else in the station reads the scenario's `loop`. With the
 loop on board, a vehicle feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All
 errors streamed to a vehicle are taken at one instant, that of the oldest among the newest states it needs. The loop
 delay counts from that instant; nothing is extrapolated, unless the station predicts.
@@ -35,7 +35,7 @@ _NEVER_NS = np.iinfo(np.int64).max
 
 
 class Moment(NamedTuple):
-    """What all vehicles have in common at a control tick."""
+    """Inputs of a control tick that are common to all vehicles."""
 
     due_ns: int
     time_s: float
@@ -46,56 +46,56 @@ class Moment(NamedTuple):
 
 
 class Orders(NamedTuple):
-    """What the set-points of a tick are made from."""
+    """Commands of a tick, from which its set-points are made."""
 
     controls: Records
     """Of `gcs.control.law.CONTROL`, for each vehicle."""
     commanded: NDArray[np.bool_]
     """Whether each vehicle is to follow the control law at this tick."""
     nominal_velocity_m_s: Vector | FloatArray
-    """Of all vehicles, or of each (n, 2)."""
+    """Common to all vehicles, or one for each (n, 2)."""
     due_ns: int
 
 
 class Loop:
-    """The loop that the station closes around each vehicle, by sending it its whole command.
+    """The ground loop: the station closes the loop around each vehicle and sends the whole command.
 
-    Other loops override what depends on where a loop is closed and on what is predicted.
+    Subclasses override what depends on where the loop is closed and on prediction.
     """
 
     heeds_deliveries = False
-    """Whether `delivered` does anything."""
+    """Whether `delivered` has any effect."""
 
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
 
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
-        """The station's share of each vehicle's command, without the lost ones: see `law.feedback_law`."""
+        """The station's part of each vehicle's command, without lost vehicles: see `law.feedback_law`."""
         return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        """Errors of every vehicle at a tick, and the acceleration it is sent: see `law.formation_control`."""
+        """Errors of every vehicle at a tick and the acceleration to send: see `law.formation_control`."""
         return formation_control(
             history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
         )
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
-        """Take in the one-way delay that was measured for a vehicle, of a message sent at `sent_ns`."""
+        """Process a measured one-way delay to a vehicle, of a message sent at `sent_ns`."""
 
     def set_points(self, orders: Orders) -> Records:
-        """The set-points (n, SET_POINT) that carry the commands of those vehicles that follow them."""
+        """The set-points (n, SET_POINT), marked `sent` for the vehicles that are commanded."""
         points = np.zeros(len(orders.controls), SET_POINT)
         accelerations(points, orders.controls, orders.commanded)
         return points
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
-        """Take in the acceleration that a vehicle is sent."""
+        """Record the acceleration commanded to a vehicle, for prediction."""
 
     def sent(self, due_ns: int, points: Records) -> None:
-        """Take in the set-points as they were sent."""
+        """Record the set-points as they were sent."""
 
     def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
-        """Take in the fields of a POSITION_TARGET_LOCAL_NED: what a vehicle followed at an instant."""
+        """Process the fields of a POSITION_TARGET_LOCAL_NED: the target that a vehicle followed at `at_ns`."""
 
     def parameters(self, system_id: int) -> dict[str, float]:
         """The parameters that must be set on a vehicle before it is armed."""
@@ -104,7 +104,7 @@ class Loop:
 
 
 def steady_loop(plan: FlightPlan) -> Loop:
-    """The loop of a formation that keeps its shape and whose nominal velocity changes in steps."""
+    """The loop of a formation that keeps its shape and whose nominal velocity is piecewise constant."""
     control = plan.scenario.control
     if control.loop == "onboard":
         return StreamedLoop(plan) if control.prediction == "off" else PredictingStreamedLoop(plan)
@@ -113,7 +113,7 @@ def steady_loop(plan: FlightPlan) -> Loop:
 
 @kernel
 def accelerations(points: Records, controls: Records, commanded: Array) -> None:
-    """Turn empty set-points into those that carry the commands of vehicles."""
+    """Fill empty set-points with the commanded accelerations."""
     for row in range(len(points)):
         points[row].sent, points[row].type_mask = commanded[row], IGNORE_ALL_BUT_ACCELERATION
         for k in range(2):
@@ -121,7 +121,7 @@ def accelerations(points: Records, controls: Records, commanded: Array) -> None:
 
 
 class PredictingGroundLoop(Loop):
-    """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
+    """The ground loop, fed with errors predicted for when each set-point acts (`gcs.control.prediction`)."""
 
     heeds_deliveries = True
 
@@ -163,13 +163,13 @@ class PredictingGroundLoop(Loop):
 
 
 class StreamedLoop(Loop):
-    """Vehicles close loops of their own: the station uploads their gains and streams what they cannot know."""
+    """Loops on board: the station uploads the vehicles' own gains and streams what depends on other vehicles."""
 
     def __init__(self, plan: FlightPlan) -> None:
         super().__init__(plan)
         own, model = own_part(plan.model, plan.gain), plan.model
         self._opened_m_s2 = np.zeros((model.vehicles, 2))
-        """K_ii^p times the offset: added when the spacing is doubled, which the vehicle's own loop does not know."""
+        """K_ii^p times the offset: to be added when the spacing is doubled, of which the loop on board is unaware."""
         for i in model.followers:
             on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
             self._opened_m_s2[i] = on_spacing @ plan.formation.offset_ne_m[i]
@@ -188,7 +188,7 @@ class StreamedLoop(Loop):
         return controls
 
     def _open(self, commands_m_s2: FloatArray, opening: float) -> None:
-        """Add to commands (n, 2) what a wider spacing takes, of which the vehicles know nothing."""
+        """Add to commands (n, 2) the part for a wider spacing, of which the loops on board are unaware."""
         commands_m_s2 += (opening - 1.0) * self._opened_m_s2
 
     def set_points(self, orders: Orders) -> Records:
@@ -204,7 +204,7 @@ class StreamedLoop(Loop):
 
 
 class PredictingStreamedLoop(StreamedLoop):
-    """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.predicted_stream`)."""
+    """The streamed loop, fed with errors predicted for when each set-point acts (`gcs.control.predicted_stream`)."""
 
     heeds_deliveries = True
 
@@ -240,12 +240,12 @@ class PredictingStreamedLoop(StreamedLoop):
         return super().set_points(orders)
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
-        del due_ns  # that of the tick begun
+        del due_ns  # the prediction knows the current tick
         self._prediction.remember(row, acceleration_m_s2)
 
 
 def _replace(controls: Records, which: NDArray[np.bool_], **fields: NDArray[Any]) -> None:
-    """Replace fields of some of the controls."""
+    """Replace fields of the selected controls."""
     for name, values in fields.items():
         controls[name][which] = values[which]
 
@@ -271,5 +271,5 @@ def _deliveries(plan: FlightPlan) -> list[Delivery]:
 
 
 def _gains(plan: FlightPlan, lost: Sequence[bool], returning: Sequence[bool] | None) -> tuple[Any, ...]:
-    """The gain schedule, or what replaces it while others do without a vehicle."""
+    """The gain schedule, or the one that replaces it while the others fly without a vehicle."""
     return plan.around_loss if plan.around_loss and any((*lost, *(returning or ()))) else plan.gains

@@ -1,14 +1,14 @@
-"""The loop of a formation that manoeuvres: another loop, fed with states relative to the planned motion.
+"""The loop of a manoeuvring formation: an inner loop, fed with states relative to the planned motion.
 
 With the planned motion r_k of vehicle k (`gcs.plan.course`), the inner loop sees
 
     x~_k = x_k - (place_k(t) - place_k(0), r_k'(t)),   each at the instant t of the state,
 
-and computes from it as if the formation flew straight on in the shape it has at the start: its law, its gains and its
-margins do not change. The planned acceleration is added to its command: r_k'' in the middle of the time over which the
+and computes commands as if the formation flew straight on in its initial shape: its law, gains and margins do not
+change. The planned acceleration r_k'' is added to its command, evaluated in the middle of the interval in which the
 set-point acts, one-way delay included. So a vehicle that follows the plan has no errors, however long the delay.
 
-Behind a leader flown by somebody else, v_d is the velocity that the leader reports. Its acceleration is not known, so
+Behind a leader flown by somebody else, v_d is the velocity that the leader reports. Its acceleration is unknown, so
 none is added for it, and errors grow in its turns.
 """
 
@@ -29,7 +29,7 @@ from scenarios.schema import NS_PER_S
 
 
 def loop_of(plan: FlightPlan, law: FlownLaw | None = None) -> Loop:
-    """The loop that a plan is made for; `law` computes its commands if it is given."""
+    """The loop for which a plan is made; the user's own `law`, if given, computes the commands."""
     loop = steady_loop(plan) if law is None else OwnLawLoop(plan, law)
     return ManoeuvringLoop(plan, loop) if plan.scenario.manoeuvres else loop
 
@@ -51,7 +51,7 @@ class ManoeuvringLoop(Loop):
         self._velocity_m_s, self._more_m_s2 = (np.zeros((plan.model.vehicles, 2)) for _ in range(2))
         """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
         self.law, self.parameters = inner.law, inner.parameters
-        self.sent, self.active = inner.sent, inner.active  # they look at differences, in which the plan cancels
+        self.sent, self.active = inner.sent, inner.active  # they use differences only, from which the plan cancels
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion

@@ -1,9 +1,9 @@
 """The user's own control law in flight: called once per tick, timed, and never trusted.
 
-The law gets the states of all vehicles at one instant, that of the oldest among their newest states, so that nothing is
-extrapolated; the loop delay counts from that instant. If it raises an exception or returns another shape, NaN or
-infinity, each vehicle concerned is sent zero acceleration: it holds its velocity. After `BAD_IN_A_ROW` such calls in a
-row the flight ends, and the vehicles hold.
+The law gets the states of all vehicles at one instant, that of the oldest among their newest states: nothing is
+extrapolated, and the loop delay counts from that instant. If it raises an exception or returns a wrong shape, NaN or
+infinity, each vehicle concerned is sent zero acceleration and holds its velocity. After `BAD_IN_A_ROW` consecutive
+calls of this kind, the flight ends and the vehicles hold.
 """
 
 from collections import Counter
@@ -33,10 +33,10 @@ _HOLD = 0.0, 0.0
 
 
 class FlownLaw:
-    """The law of a flight, its memory and its record.
+    """The user's law in one flight, with its memory and the counts of its calls.
 
-    `report` records an event: its kind, its text, no system id, and its counts. `stop` ends the flight for a reason.
-    `clock_ns` measures how long calls take; None in virtual time, in which nothing may depend on the machine.
+    `report` records an event: kind, text, no system id, counts. `stop` ends the flight for the reason given.
+    `clock_ns` measures the duration of calls; None in virtual time, where nothing may depend on the machine.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class FlownLaw:
         self._bad_in_a_row = 0
 
     def commands(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
-        """The acceleration of each vehicle, zero in place of one that cannot be used; lost vehicles have NaN states."""
+        """The acceleration of each vehicle, or zero if the law's is unusable. The states of lost vehicles are NaN."""
         lost: list[bool] = np.isnan(states[:, 0]).tolist()
         clock_ns, fault = self._clock_ns, ""
         began_ns = 0 if clock_ns is None else clock_ns()
@@ -75,7 +75,7 @@ class FlownLaw:
         self._report(LAW, ", ".join(texts), None, dict(self._counts))
 
     def _called(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
-        with np.errstate(all="ignore"):  # what is not finite is counted
+        with np.errstate(all="ignore"):  # results that are not finite are counted instead
             answer = self._law(t_s, states, formation, self._memory)
         return [(north, east) for north, east in accelerations(answer, len(states)).tolist()]
 
@@ -103,7 +103,7 @@ class OwnLawLoop(Loop):
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
-        """The law with zero gains: it gives the spacing errors and says who is lost."""
+        """The law with zero gains, which still gives the spacing errors and marks the lost vehicles."""
         return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:

@@ -1,4 +1,4 @@
-"""The phases of a flight, as a pure function. The mode of each vehicle is up to `gcs.station.monitor`."""
+"""The phases of a flight, as a pure function. `gcs.station.monitor` decides the mode of each vehicle."""
 
 from enum import StrEnum
 
@@ -9,9 +9,9 @@ class Phase(StrEnum):
     """The phase of a flight."""
 
     CONNECTING = "connecting"  # until every vehicle is heard, armed and guided, and its clock is known
-    IDENTIFYING = "identifying"  # vehicles with autopilots show how they respond to set-points
+    IDENTIFYING = "identifying"  # the response of vehicles with autopilots to set-points is measured
     FLYING = "flying"
-    ENDING = "ending"  # no more set-points, until every vehicle is seen to hold or land
+    ENDING = "ending"  # no more set-points, until every vehicle reports that it holds or lands
     ENDED = "ended"
 
 
@@ -20,8 +20,8 @@ def next_phase(
 ) -> Phase:
     """The phase that follows.
 
-    CONNECTING is followed by FLYING once all are ready, or by IDENTIFYING if they are not identified yet. A stop for
-    any reason leads from each of these to ENDING, and ENDED follows when all hold, or after `END_PATIENCE_S`.
+    Once all vehicles are ready, CONNECTING is followed by FLYING, or by IDENTIFYING if they are not identified yet. A
+    stop for any reason leads from each of these to ENDING; ENDED follows when all hold, or after `END_PATIENCE_S`.
     """
     match phase:
         case Phase.CONNECTING | Phase.IDENTIFYING | Phase.FLYING if stop:
@@ -37,15 +37,15 @@ def next_phase(
 
 
 START_PATIENCE_S = 360.0
-"""How long vehicles with autopilots may take until all are ready."""
+"""Timeout for vehicles with autopilots to become ready."""
 _LAUNCHED_PATIENCE_S = 20.0
-"""The same for vehicles that are launched in the air."""
+"""Timeout for vehicles launched in the air to become ready."""
 _ROUND_TRIPS = 40.0
-"""On slow links a start-up may take this many round trips: commands await each other's answers and are repeated."""
+"""Round trips that a start-up may take on slow links: each command awaits the previous answer, and some are resent."""
 
 
 def patience_s(scenario: Scenario) -> float:
-    """How long a flight may take to begin. Until it begins, scenario time is the time since the start minus this."""
+    """Timeout for a flight to begin. Until it begins, scenario time is the time since the start minus this."""
     least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else _LAUNCHED_PATIENCE_S
     return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
 
@@ -57,4 +57,4 @@ def longest_round_trip_s(scenario: Scenario) -> float:
 
 
 END_PATIENCE_S = 6.0
-"""How long the station waits until the vehicles hold: their time-outs plus a heartbeat over a slow link."""
+"""How long the station waits for the vehicles to hold: their timeouts plus a heartbeat over a slow link."""

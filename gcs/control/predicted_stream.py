@@ -1,13 +1,13 @@
 """Prediction with the loop on board: the state of the formation at the instant when a streamed acceleration acts.
 
-Vehicles feed back their own errors, so the motion of one depends on those in front of it. The state z of the formation
-holds each vehicle's velocity minus the nominal velocity at the start, and each spacing error p_i = Z_ahead - Z_i +
+Vehicles feed back their own errors, so the motion of each depends on those in front of it. The state z of the formation
+holds each vehicle's velocity minus the initial nominal velocity, and each spacing error p_i = Z_ahead - Z_i +
 offset_i. With the vehicles' own loops in A (`gains.sampled.onboard.streamed_loop`), and w_i and v_d sent to vehicle i,
 
     z' = A z + B u,   u_i = w_i - K_ii^v v_d.
 
-What is sent to vehicle i at tick t_k acts at t_k + D_i, its delivery delay (`gcs.control.prediction`). With X_i the
-response to u_i alone, over the times at which set-points were due,
+The set-point sent to vehicle i at tick t_k acts at t_k + D_i, where D_i is its delivery delay
+(`gcs.control.prediction`). With X_i the response to u_i alone, as a function of the time when set-points were due,
 
     z^(t) = e^{A (t - s)} (z(s) - sum_i X_i(s - D_i)) + sum_i X_i(t - D_i).
 
@@ -30,11 +30,11 @@ from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from scenarios.schema import NS_PER_S
 
 _GRID_S = 1e-3
-"""Exponentials are computed for whole milliseconds; a second-order series adds the rest: within 1e-9 at 20 1/s."""
+"""Exponentials are computed for whole milliseconds; a second-order series adds the rest, within 1e-9 at 20 1/s."""
 
 
 class StreamPrediction:
-    """What was sent to each vehicle, and the state of the formation that follows from it."""
+    """The commands sent to each vehicle, and the formation state predicted from them."""
 
     def __init__(self, plan: FlightPlan, deliveries: Sequence[Delivery]) -> None:
         model, timing = plan.model, onboard_timing(plan.scenario)
@@ -56,7 +56,7 @@ class StreamPrediction:
         self._needs: tuple[FeedbackLaw | None, list[list[int]]] = None, []
 
     def look(self, history: Reports, law: FeedbackLaw, due_ns: int, nominal_m_s: Sequence[float]) -> None:
-        """Begin a tick: what was sent to each vehicle goes on until `remember` says otherwise."""
+        """Begin a tick: the last command to each vehicle remains in effect until `remember` replaces it."""
         if self._needs[0] is not law:
             self._needs = law, [self._needed(law, row) for row in range(len(law.ahead))]
             self._flown: list[bool] = law.flown.tolist()
@@ -82,7 +82,7 @@ class StreamPrediction:
             self._delivery_ns.append(delivery.assumed_ns(due_ns, self._age_ns[row]) if used_ns else None)
 
     def remember(self, row: int, acceleration_m_s2: Sequence[float]) -> None:
-        """The acceleration streamed to a vehicle at this tick."""
+        """Record the acceleration streamed to a vehicle at this tick."""
         self._sent_ns[row], self._streamed[row] = self._now_ns, acceleration_m_s2
         self._inputs[-1][row] = self._streamed[row] - self._on_velocity[row] @ self._target
 
@@ -94,7 +94,7 @@ class StreamPrediction:
     def states(self, row: int) -> tuple[int, float, list[State]] | None:
         """When a vehicle's set-point acts (ns), the assumed loop delay (s), and all states then, seen from the leader.
 
-        None while a state or a delivery delay is unknown, or a vehicle whose motion matters is lost.
+        None while a needed state or the vehicle's own delivery delay is unknown, or a needed vehicle is lost.
         """
         model, needed, used_ns = self._model, self._needs[1][row], self.used_ns(row)
         delays = [self._delivery_ns[k] for k in needed]
@@ -140,7 +140,7 @@ class StreamPrediction:
         return self._flow.pushed(one[:, 0], own.ravel(), time_ns - self._due_ns[place])
 
     def _needed(self, law: FeedbackLaw, row: int) -> list[int]:
-        """The vehicles whose motion decides the command: its sources, and those in front of them."""
+        """The vehicles on whose motion the command depends: its sources, and all vehicles in front of them."""
         found: set[int] = {*law.source[law.needed & (law.to == row)].tolist()}
         for vehicle in reversed(range(self._model.vehicles)):  # those in front have lower numbers
             if vehicle in found:
@@ -149,7 +149,7 @@ class StreamPrediction:
 
 
 class _Flow:
-    """z' = A z + B u, u constant, over any duration."""
+    """The solution of z' = A z + B u with constant u over any duration."""
 
     def __init__(self, A: FloatArray, B: FloatArray) -> None:
         self._n = len(A)
@@ -158,7 +158,7 @@ class _Flow:
         self._grid = lru_cache(maxsize=1024)(self._exponential)
 
     def moved(self, responses: FloatArray, inputs: FloatArray, duration_ns: int) -> FloatArray:
-        """Every X_i after a time."""
+        """Every X_i after a duration."""
         vehicles, each = inputs.shape
         spread = np.zeros((vehicles * each, vehicles))
         for k in range(vehicles):
@@ -166,7 +166,7 @@ class _Flow:
         return self._on(np.vstack([responses, spread]), duration_ns)[: self._n]
 
     def pushed(self, z: FloatArray, u: FloatArray, duration_ns: int) -> FloatArray:
-        """z after a time under a constant u."""
+        """z after a duration under a constant u."""
         return self._on(np.concatenate([z, u]), duration_ns)[: self._n]
 
     def extrapolated(self, z: FloatArray, duration_ns: int) -> FloatArray:

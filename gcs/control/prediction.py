@@ -1,17 +1,17 @@
 """Prediction of each vehicle's state at the instant when its next set-point acts, from the set-points already sent.
 
-A set-point that is due at tick t_k acts at t_k + D. The *delivery delay* D of a vehicle is computing + down
-(`gcs.control.loop_delay`), as far as it is known. The newest state (x, v), sampled at s, is propagated to that instant
-under the accelerations u that act in between:
+A set-point that is due at tick t_k acts at t_k + D. The *delivery delay* D of a vehicle is an estimate of computing +
+down (`gcs.control.loop_delay`). The newest state (x, v), sampled at s, is propagated to that instant under the
+accelerations u that act in between:
 
     h = t_k + D - s,   v^ = v + V(t_k) - V(s - D),   x^ = x + v h + P(t_k) - P(s - D) - V(s - D) h,
 
-where V' = u and P' = V over the times at which set-points were due, each held until the next. With a response V' is the
-acceleration that follows u (`gcs.control.responding`). This is x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of
-`gains.sampled.prediction`, with fractions of a period where s lies between ticks. V and P are kept as running sums, so
-the cost does not grow with the delay.
+where V' = u and P' = V, as functions of the time when set-points were due, each held until the next. With a response,
+V' is the acceleration with which the vehicle follows u (`gcs.control.responding`). This is x^ = Phi(h) x + sum_j
+Gamma_j u_{k-j} of `gains.sampled.prediction`, with fractions of a period if s lies between ticks. V and P are kept as
+running sums, so the cost does not grow with the delay.
 
-The assumed loop delay is the mean age of the states when they are first used, plus D.
+The assumed loop delay is the mean age of the states at their first use, plus D.
 """
 
 from bisect import bisect_left, bisect_right
@@ -29,54 +29,54 @@ from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
 
 KEPT_S = 3.0 * PREDICTION_MAX_S
-"""How long set-points are remembered: longer than any assumed delay, for states that are older than assumed."""
+"""How long set-points are remembered: longer than any assumed delay, because states may be older than assumed."""
 FASTEST = 0.1
-"""Fastest change of an assumed delay, in s per s."""
+"""Largest rate of change of an assumed delay, in s per s."""
 _SMOOTHED_S = 2.0
-"""Time constant of the filter for measured delivery delays, and over how long ages are averaged that decide about D."""
+"""Time constant of the filter for measured delivery delays, and averaging time of the ages from which D is derived."""
 _AHEAD_S = 5.0
-"""How long the trend of the measured delivery delays is extrapolated without a new measurement."""
+"""Longest extrapolation of the trend of the measured delivery delays without a new measurement."""
 
 
 Motion = tuple[complex, complex, tuple[complex, ...]]
-"""V, P and what else the motion of a vehicle depends on; vectors are north + 1j * east."""
+"""V, P and further states of a vehicle's motion; vectors are north + 1j * east."""
 
 
 class AtOnce:
-    """How a vehicle moves under the accelerations that it is sent, if it follows them at once: V' = u.
+    """The motion of a vehicle that follows accelerations without lag: V' = u.
 
-    Velocity that a lost set-point would have brought is never made up.
+    The velocity change of a lost set-point is never made up.
     """
 
     rest: Motion = 0j, 0j, ()
 
     def moved(self, motion: Motion, u: complex, duration_s: float) -> Motion:
-        """The motion after a time under an acceleration."""
+        """The motion after a duration under a constant acceleration."""
         velocity, position, none = motion
         return velocity + u * duration_s, position + (velocity + 0.5 * u * duration_s) * duration_s, none
 
     def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
-        """The motion when the vehicle takes a set-point again, after its velocity had strayed from the set-points'."""
+        """The motion when the vehicle takes a set-point again, after its velocity has strayed by `astray_m_s`."""
         del astray_m_s
         return motion
 
 
 class _Sent(NamedTuple):
-    """A set-point, with the motion at the time it is due."""
+    """A set-point, with the motion at the time when it is due."""
 
     due_ns: int
     u: complex
     motion: Motion
     off: complex = 0j
-    """How much u has been altered."""
+    """By how much u has been altered."""
     astray_m_s: complex = 0j
     """The integral of `off` since the vehicle last took a set-point."""
 
 
 class CommandHistory:
-    """The accelerations sent to one vehicle, each held until the next, but for `held_ns` at most.
+    """The accelerations sent to one vehicle, each held until the next, but for at most `held_ns`.
 
-    Without set-points for that long a vehicle enters its failsafe, in which it holds its velocity.
+    Without set-points for that long, a vehicle enters its failsafe, in which it holds its velocity.
     """
 
     def __init__(self, held_ns: int, responds: AtOnce | None = None) -> None:
@@ -84,10 +84,10 @@ class CommandHistory:
         self._sent: list[_Sent] = [_Sent(0, 0j, self._responds.rest)]
         self._due_ns = [0]
         self._known = 1
-        """How many set-points, from the oldest on, have an up-to-date motion."""
+        """Number of set-points, from the oldest on, whose motion is up to date."""
 
     def add(self, due_ns: int, acceleration_m_s2: Sequence[float]) -> None:
-        """Remember the set-point of a tick; ticks come in order."""
+        """Record the set-point of a tick; ticks must be in order."""
         self._settle()
         self._sent.append(self._after(self._sent[-1], _Sent(due_ns, complex(*acceleration_m_s2), self._responds.rest)))
         self._due_ns.append(due_ns)
@@ -97,7 +97,7 @@ class CommandHistory:
         self._known = len(self._sent)
 
     def alter(self, due_ns: int, by_m_s2: complex) -> None:
-        """Change the acceleration of the set-point due at a time, if it is remembered: another one acted."""
+        """Change the acceleration of the set-point due at a time, if still remembered: a different one acted."""
         place = bisect_left(self._due_ns, due_ns)
         if place < len(self._sent) and self._due_ns[place] == due_ns:
             own = self._sent[place]
@@ -131,7 +131,7 @@ class CommandHistory:
 
 
 def carried(sent: CommandHistory, state: State, from_ns: int, to_ns: int) -> State:
-    """The state propagated under the set-points due between two times."""
+    """A state propagated from one time to another under the set-points due in between."""
     (velocity, position), (later_velocity, later_position) = sent.sums(from_ns), sent.sums(to_ns)
     north, east, v_north, v_east = state
     for_s = (to_ns - from_ns) * 1e-9
@@ -151,7 +151,7 @@ class FixedDelivery:
         self._assumed_ns = round(assumed_s * NS_PER_S)
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
-        """Take in the one-way delay of a request that left at `sent_ns`; nothing to do, as the delay is given."""
+        """Ignore a measured one-way delay: the delay is given."""
 
     def assumed_ns(self, due_ns: int, age_ns: int) -> int:
         """D of the set-point due now; `age_ns` is the mean age of states at their first use."""
@@ -160,21 +160,21 @@ class FixedDelivery:
 
 
 class MeasuredDelivery:
-    """The same from measured one-way delays, smoothed along their trend; it changes at the rate `FASTEST` at most.
+    """The delivery delay D of one vehicle from measured one-way delays, smoothed along their trend.
 
-    A fading-memory filter of second order: it follows a steadily growing delay without lag, although a measurement is
-    known only one round trip after its request was sent. R. Morrison, "Introduction to sequential smoothing and
-    prediction" (1969), ch. 9.
+    A second-order fading-memory filter: it tracks a steadily growing delay without lag, although a measurement is known
+    only one round trip after its request was sent. D changes at the rate `FASTEST` at most. R. Morrison, "Introduction
+    to sequential smoothing and prediction" (1969), ch. 9.
     """
 
     def __init__(self) -> None:
         self._level_ns = self._trend = 0.0
         self._at_ns = 0
         self._assumed: tuple[int, float] | None = None
-        """The last tick for which D was asked, and that D."""
+        """The last tick for which D was computed, and its value."""
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
-        """Take in the one-way delay of a request that left at `sent_ns`."""
+        """Process the one-way delay of a request that left at `sent_ns`."""
         since_ns = sent_ns - self._at_ns
         if self._at_ns == 0:
             self._level_ns, self._at_ns = float(down_ns), sent_ns
@@ -205,10 +205,10 @@ Delivery = FixedDelivery | MeasuredDelivery
 
 
 class FirstUses:
-    """The mean age of one vehicle's states at the ticks that first use them, over the last of them.
+    """Moving average of the age of one vehicle's states at their first use by a tick.
 
-    These are the commands in a common period of both rates. If D is a given loop delay minus this age, they are those
-    of about `_SMOOTHED_S`: the age of each state is known, so its jitter must not change D (`gains.varying.predicted`).
+    The window is one common period of the control and telemetry rates. If D is a given loop delay minus this age, it is
+    about `_SMOOTHED_S`: each state's age is known, so its jitter must not change D (`gains.varying.predicted`).
     """
 
     def __init__(self, timing: Timing, *, given: bool) -> None:
@@ -225,7 +225,7 @@ class FirstUses:
 
 
 class PredictedStates(States):
-    """States predicted beyond the newest reports, as of the last `look`."""
+    """States predicted beyond the newest reports, as of the last call of `look`."""
 
     def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], timing: Timing) -> None:
         self.deliveries, self._sent = deliveries, sent
@@ -234,7 +234,7 @@ class PredictedStates(States):
         self._history: Reports = StateHistory(len(sent))
 
     def look(self, history: Reports, due_ns: int) -> tuple[Instants, FloatArray]:
-        """Take in the newest states. Returns when each vehicle's set-point acts (ns) and the assumed loop delay (s).
+        """Read the newest states. Returns when each vehicle's set-point acts (ns) and the assumed loop delay (s).
 
         Both are 0 while its state or D is unknown.
         """

@@ -1,7 +1,7 @@
 """The motion of a vehicle that follows its set-points with a response, such as an autopilot's lag; for prediction.
 
-The acceleration a follows the commands u by a response (`gains.performance.response`), linear with constant
-coefficients. In modes m it is
+The acceleration a follows the commands u with a linear time-invariant response (`gains.performance.response`). In modal
+coordinates m,
 
     m_k' = lambda_k m_k + beta_k u,   a = sum_k gamma_k m_k,   V' = a,   P' = V.
 
@@ -20,7 +20,7 @@ from gains.performance.response import Response, formation_loop
 from gcs.control.prediction import AtOnce, Motion
 
 _APART = 1e-3
-"""Relative change of the lag that separates coinciding modes; smaller than identification resolves."""
+"""Relative change of the lag that separates coincident modes; below the resolution of identification."""
 
 
 class _Mode(NamedTuple):
@@ -31,14 +31,14 @@ class _Mode(NamedTuple):
     share: complex
     """gamma."""
     owed: complex
-    """What 1 m/s of owed velocity adds to m; 0 if the response has no such state."""
+    """The change of m per 1 m/s of owed velocity; 0 if the response has no such state."""
 
 
 class Responding(AtOnce):
-    """The motion of a vehicle with a response, for `gcs.control.prediction.CommandHistory`; it holds V, P and the m.
+    """The motion (V, P and the modes m) of a vehicle with a response, for `gcs.control.prediction.CommandHistory`.
 
     The velocity in a set-point is the integral of all accelerations sent. A vehicle that holds an earlier set-point
-    strays from this velocity. When it takes the next, the velocity that it *owes*, set-point minus own, jumps.
+    strays from this velocity. At the next set-point, the velocity that it *owes*, set-point minus own, jumps.
     """
 
     def __init__(self, response: Response) -> None:

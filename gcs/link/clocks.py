@@ -1,41 +1,40 @@
 """Round trip and clock offset of one vehicle, from its TIMESYNC exchanges.
 
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
-is half the difference between the delays down and up, at most RTT / 2. The estimate is a straight line. Its slope is
-fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. The previous slope is kept if jitter
-may have tilted the new one by more than the uncertainty of the previous one.
+is half the difference between the delays down and up, at most RTT / 2. The estimate is a straight line over a sliding
+window of exchanges. Its slope is a least-squares fit to their offsets, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. If
+jitter may have tilted the new slope by more than the uncertainty of the previous one, the previous slope is kept.
 
-The line lies midway between two limits: the lower by the quickest way up, the upper by the quickest way down. With
-jitter these are rarely ways of one exchange. While exchanges are few, the first states count as ways up, too:
-`time_boot_ms` is rounded down, so no state is sampled before its stamp or after its reception. If the quickest ways of
-the window are slower than those behind the previous line, by more than its drift explains, that line is extrapolated.
-One wrong stamp can set a limit. Where stamps err, the estimate is the weighted mean of the offsets instead, kept within
-the known error of the stamps from the midpoint.
+The level of the line is midway between two limits of the offset: the shortest delay up sets the lower, the shortest
+delay down the upper. With jitter the two rarely belong to the same exchange. While exchanges are few, the first states
+also count as delays up: `time_boot_ms` is rounded down, so no state is sampled before its stamp or after its reception.
+If the shortest delays in the window exceed those behind the previous line by more than drift explains, the previous
+line is extrapolated. A single wrong stamp can set a limit. If stamps are known to err, the level is therefore the
+weighted mean of the offsets, kept within the known stamp error of the midpoint.
 
-The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
+The error bound does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
 DRIFT_BOUND. The line is kept between them, and the bound is the distance to the farther one. It holds for any delay,
 loss and asymmetry as long as the clock drifts by less than DRIFT_BOUND and has not jumped since the newest exchange.
 
 Limits that contradict each other show that the clock has jumped, or that replies carry wrong stamps: an autopilot may
-backdate them by the time that their bytes take on a serial port, and a simulator's clock slips. A contradiction by
-more than STAMPS_OFF_NS is a jump. A smaller one is in doubt; until it is decided, the bound covers the limits from
-before it and since. If later exchanges fit the limits from before, the contradiction was an error of stamps:
-`stamp_error_ns` is the largest seen so far, and later contradictions up to that size do not count. The eighth doubtful
-exchange in a row is a jump.
+backdate a stamp by the time the reply spends on a serial port, and a simulator's clock slips. A contradiction by more
+than STAMPS_OFF_NS is a jump. A smaller one is doubtful; until it is resolved, the bound covers the limits from before
+and after it. If later exchanges fit the limits from before, the contradiction was a stamp error: `stamp_error_ns` is
+the largest so far, and later contradictions up to it are ignored. The eighth doubtful exchange in a row is a jump.
 
 A jump shorter than a round trip may not contradict the limits. But exchanges then lie farther from the line than their
-round trips, the earlier residuals and the known error of the stamps explain. Such exchanges are doubtful, too; the
-third in a row that is off by more than STAMPS_OFF_NS is a jump.
+round trips, the earlier residuals and the known stamp error explain. Such exchanges are doubtful, too. If the first is
+off by more than STAMPS_OFF_NS, the third is a jump, unless one in between fits the line well enough to refute it.
 
-An error that is the same in all stamps cannot be seen: it looks like an asymmetric link. `expected_error_ns` holds what
-is known beforehand of the errors of a kind of vehicle. The bound includes the largest error that exchanges have shown
-and the least round trip: the exchange that showed it may itself have been off by that much.
+An error common to all stamps cannot be observed: it looks like an asymmetric link. `expected_error_ns` is the stamp
+error known in advance for a kind of vehicle. The bound includes the largest error that exchanges have shown plus the
+least round trip, because the exchange that showed it may itself have been off by that much.
 
 Telemetry shows a jump sooner: a state cannot have been sampled after it was received, nor before one that was sent
-earlier. Such a state is refused, and an exchange is due at once to decide. A state ahead of its reception by no more
-than the bound is taken to have been sampled when it was received. An overtaken state may predate a jump: it proves
-nothing, and after a jump it is refused.
+earlier. Such a state is refused, and an exchange is due at once to decide. A state whose stamp is ahead of its
+reception by no more than the bound is taken to have been sampled when it was received. An overtaken state may predate a
+jump: it proves nothing, and after a jump it is refused.
 
 In a loop closed on the ground, the error of the offset cancels from the loop delay, see `gcs.control.loop_delay`.
 """
@@ -49,24 +48,24 @@ from scenarios.kernel import Array, Cell, Columns, Record, Records, array_kernel
 from scenarios.schema import DRIFT_MAX_PPM
 
 WINDOW = 128
-"""Exchanges kept for each vehicle: 13 s at 10 Hz, over which a drifting clock is straight to a few µs."""
+"""Exchanges kept for each vehicle: 13 s at 10 Hz, during which clock drift is linear to within a few µs."""
 LEAST_SAMPLES = 5
 """A clock counts as known after this many exchanges."""
 LATEST_NS = 1 << 62
 """Largest plausible clock reading, 146 years; a clock set back may be negative. Differences fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
 MOST_PENDING = 4096
-"""Most requests that are remembered without a reply: 20 s at 200 Hz."""
+"""Maximum number of unanswered requests remembered: 20 s at 200 Hz."""
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
-"""Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
+"""Maximum rate difference of two clocks; an offset that changes faster has jumped."""
 DOUBTS, SMALL_DOUBTS = 3, 8
-"""This many doubtful exchanges in a row are a jump: those off by more than STAMPS_OFF_NS, and all others. With two
+"""Doubtful exchanges that make a jump: if the first is off by more than STAMPS_OFF_NS, and in a row otherwise. With two
 fifths of all replies off, eight in a row that exceed all before are rarer than once in a thousand first doubts."""
 STAMPS_OFF_NS = 20_000_000
 """The largest plausible error of a reply's stamp: 115 bytes at 57600 baud."""
 _SETTLED = 32
-"""Before this many exchanges a small jump cannot be told from errors of stamps, whose size is not yet known."""
+"""Before this many exchanges, a small jump is indistinguishable from stamp errors, whose size is not yet known."""
 _UNUSUAL = 1.5
 """An exchange this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
@@ -76,16 +75,16 @@ _WRAP_NS = _BOOT_MS_NS << 32
 """time_boot_ms wraps after this, 49.7 days; a clock set back to before its boot wraps too."""
 _DOUBTFUL_NS = 10_000
 """An exchange this close to the line is never doubtful."""
-_FLOOR_NS = 200_000.0  # queueing too short to tell good exchanges from bad ones
+_FLOOR_NS = 200_000.0  # queueing shorter than this does not distinguish good exchanges from bad ones
 _TILT = 100e-6
-"""An upper bound of how much the rates of two crystals differ."""
+"""Upper bound of the rate difference of two crystals."""
 _WANDER = 10e-6
-"""How far the rate of a crystal changes with its temperature."""
+"""Change of a crystal's rate with temperature."""
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 5
-"""After the first samples the line is fitted at every fifth only, to save time, and extrapolated in between."""
+"""After the first samples, the line is fitted only at every fifth, to save time, and extrapolated in between."""
 UNKNOWN = -1
-"""In place of a duration that is not known."""
+"""Stands for an unknown duration."""
 _Floats = NDArray[np.float64]
 
 CLOCK = np.dtype(
@@ -96,36 +95,36 @@ CLOCK = np.dtype(
         ("rtt_ns", "i8"),  # round trip of the newest exchange, or UNKNOWN
         ("down_ns", "i8"),  # one-way delay from station to vehicle in it, by the estimated offset, or UNKNOWN
         ("down_bound_ns", "f8"),  # its largest error
-        ("loop_bound_ns", "f8"),  # largest error that clocks bring into a loop delay: age of newest state + down_ns
-        ("unmatched", "i8"),  # replies to no request
-        ("expected_error_ns", "i8"),  # largest error of stamps that is usual for this kind of vehicle
-        ("stamp_error_ns", "f8"),  # largest error of stamps that contradictions between exchanges have shown
+        ("loop_bound_ns", "f8"),  # largest clock error in a loop delay, age of newest state + down_ns
+        ("unmatched", "i8"),  # replies that match no request
+        ("expected_error_ns", "i8"),  # largest stamp error usual for this kind of vehicle
+        ("stamp_error_ns", "f8"),  # largest stamp error that contradictions between exchanges have shown
         ("lost", "?"),  # known to have jumped, but not yet by how much
         ("asked_ns", "i8"),  # when the last request was sent
         ("doubtful_state", "?"),
         ("newest_boot_ns", "i8"),  # boot time of the newest accepted state since the last jump
         ("count", "i8"),  # exchanges since the last jump
         ("pending", "i8"),  # requests without a reply
-        ("state_low_ns", "i8"),  # lower limit of the offset by the quickest of the first states
-        ("state_at_ns", "i8"),  # when that was received
+        ("state_low_ns", "i8"),  # tightest lower limit of the offset from the first states
+        ("state_at_ns", "i8"),  # when the state that gave it was received
         ("least_ns", "i8"),  # least round trip of the window at the last fit
-        ("unusual_ns", "i8"),  # largest residual then
-        ("ways_ns", "f8"),  # quickest way up plus quickest way down behind the line
-        ("fitted_ns", "i8"),  # when it was fitted
+        ("unusual_ns", "i8"),  # largest residual at the last fit
+        ("ways_ns", "f8"),  # shortest delay up plus shortest delay down behind the line
+        ("fitted_ns", "i8"),  # when the line was fitted
         ("tilt", "f8"),  # largest error of the line's rate
         ("limits", "i8", (4,)),  # of the offset: see `Limits`
-        ("in_doubt", "?"),  # whether there was a doubtful exchange and it is not yet decided whether the clock jumped
-        ("limits_in_doubt", "i8", (4,)),  # those since the first doubtful exchange
-        ("doubtful_gap_ns", "f8"),  # the largest contradiction of these
-        ("ahead_ns", "f8"),  # most by which a state since the newest exchange was sampled after reception, beyond bound
-        ("held_back_ns", "i8"),  # the same within the bound: taken to have been sampled when it was received
+        ("in_doubt", "?"),  # an exchange was doubtful, and whether the clock jumped is still undecided
+        ("limits_in_doubt", "i8", (4,)),  # limits since the first doubtful exchange
+        ("doubtful_gap_ns", "f8"),  # largest contradiction of the doubtful exchanges
+        ("ahead_ns", "f8"),  # largest lead, beyond the bound, of a state over its reception since the newest exchange
+        ("held_back_ns", "i8"),  # largest such lead within the bound: the state counts as sampled at reception
         ("since_ns", "i8"),  # when the first exchange since the last jump was requested
-        ("doubts", "i8"), ("doubts_in_a_row", "i8"),  # how many exchanges were doubtful, and how many in a row
-        ("doubted_ns", "i8"),  # the residual of the first
+        ("doubts", "i8"), ("doubts_in_a_row", "i8"),  # doubtful exchanges since they were last refuted, and in a row
+        ("doubted_ns", "i8"),  # residual of the first doubtful exchange
     ],
     align=True,
 )  # fmt: skip
-"""What is known of one vehicle's clock."""
+"""Clock estimate and exchange statistics of one vehicle."""
 EXCHANGES = np.dtype([("sent_ns", "i8"), ("rtt_ns", "i8"), ("offset_ns", "i8")])
 
 
@@ -145,7 +144,7 @@ class ClockEstimate(NamedTuple):
         return offset_at_ns(self, time_ns)
 
     def bound_at_ns(self, time_ns: int) -> float:
-        """The largest error of the offset, or of an instant from `to_station_ns`, near a time of the station."""
+        """The largest error, near a station time, of the offset or of an instant from `to_station_ns`."""
         return bound_at_ns(self, time_ns)
 
     def to_station_ns(self, boot_ns: int) -> int:
@@ -154,7 +153,7 @@ class ClockEstimate(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Limits of the offset, each with the time at which it holds; in between they move apart by DRIFT_BOUND."""
+    """Limits of the offset, each with the time at which it holds; away from that time they widen by DRIFT_BOUND."""
 
     low_ns: int
     low_at_ns: int
@@ -205,7 +204,7 @@ def _high_at(limits: Limits, time_ns: int) -> int:
 
 @kernel
 def _gap_ns(own: Limits, other: Limits) -> float:
-    """By how much limits exclude others, whatever the drift in between; 0 or less if they do not."""
+    """The gap between two pairs of limits that no drift can explain; 0 or less if they are compatible."""
     return max(
         other.low_ns - own.high_ns - DRIFT_BOUND * abs(other.low_at_ns - own.high_at_ns),
         own.low_ns - other.high_ns - DRIFT_BOUND * abs(other.high_at_ns - own.low_at_ns),
@@ -214,7 +213,7 @@ def _gap_ns(own: Limits, other: Limits) -> float:
 
 @kernel
 def _joined(own: Limits, other: Limits, tighter: bool) -> Limits:
-    """The tighter or the wider of both, compared at the newer time."""
+    """The intersection (`tighter`) or the union of two pairs of limits, compared at the newer time."""
     low_at_ns, high_at_ns = max(own.low_at_ns, other.low_at_ns), max(own.high_at_ns, other.high_at_ns)
     low_ns, other_low_ns = _low_at(own, low_at_ns), _low_at(other, low_at_ns)
     high_ns, other_high_ns = _high_at(own, high_at_ns), _high_at(other, high_at_ns)
@@ -225,7 +224,7 @@ def _joined(own: Limits, other: Limits, tighter: bool) -> Limits:
 
 @kernel
 def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
-    """Note a request sent now; returns its ts1, unique among the pending requests."""
+    """Record a request sent now; returns its ts1, unique among the pending requests."""
     clock.asked_ns = now_ns
     while _place(clock, pending_ns, now_ns) >= 0:
         now_ns += 1
@@ -240,7 +239,7 @@ def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
 
 @kernel
 def note_sent(clocks: Records, pending_ns: NDArray[np.int64], rows: Array, sent_ns: Array) -> None:
-    """Note when the newest requests to some vehicles were sent: after the step that made them."""
+    """Record when the newest requests to some vehicles were actually sent, after the step that made them."""
     for k in range(len(rows)):
         place = clocks[rows[k]].pending - 1
         if place >= 0:
@@ -249,7 +248,7 @@ def note_sent(clocks: Records, pending_ns: NDArray[np.int64], rows: Array, sent_
 
 @kernel
 def _place(clock: Record, pending_ns: NDArray[np.int64], ts1_ns: int) -> int:
-    """The place of a request among those pending, oldest first; -1 if it is not among them."""
+    """The index of a request among the pending ones, oldest first; -1 if it is not pending."""
     for place in range(clock.pending - 1, -1, -1):
         if pending_ns[place, 0] == ts1_ns:
             return place
@@ -265,7 +264,7 @@ def _drop(clock: Record, pending_ns: NDArray[np.int64], place: int) -> None:
 
 @kernel
 def boot_ns_of(known: ClockEstimate, boot_ms: int, near_ns: int) -> int:
-    """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
+    """A time_boot_ms received near a station time, as an instant of the vehicle's clock with wraps undone."""
     boot_ns = boot_ms * _BOOT_MS_NS
     if known.samples == 0:
         return boot_ns
@@ -277,7 +276,7 @@ def boot_ns_of(known: ClockEstimate, boot_ms: int, near_ns: int) -> int:
 def sampled_ns(clock: Record, boot_ms: int, received_ns: int, newest: bool) -> int:
     """The station's time at which a state was sampled; UNKNOWN if it is unknown or impossible.
 
-    `newest` says that its sequence number shows that it was sent after all states received before.
+    `newest`: its sequence number shows that it was sent after all states received before.
     """
     known = estimate_of(clock)
     if known.samples == 0:
@@ -293,10 +292,10 @@ def sampled_ns(clock: Record, boot_ms: int, received_ns: int, newest: bool) -> i
         clock.held_back_ns = max(clock.held_back_ns, ahead_ns)
         sample_ns = received_ns
     if newest and boot_ns < clock.newest_boot_ns:
-        clock.doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
+        clock.doubtful_state = True  # a jump, or a replay too old for sequence numbers to detect: the exchange decides
         return UNKNOWN
     if not newest and sample_ns < clock.since_ns:
-        return UNKNOWN  # of the clock before a jump that an exchange has shown: its instant is unknown
+        return UNKNOWN  # stamped before a jump that an exchange has shown, so its instant is unknown
     clock.newest_boot_ns = max(boot_ns, clock.newest_boot_ns)
     if newest and clock.count < _EVERY_SAMPLE and boot_ns - received_ns > clock.state_low_ns:
         clock.state_low_ns, clock.state_at_ns = boot_ns - received_ns, received_ns
@@ -305,7 +304,7 @@ def sampled_ns(clock: Record, boot_ms: int, received_ns: int, newest: bool) -> i
 
 @kernel
 def _is_ahead(clock: Record, beyond_ns: float, received_ns: int, newest: bool) -> None:
-    """Note a state from the future. An overtaken one may bear a stamp from before a jump: it proves nothing."""
+    """Record a state stamped in the future. An overtaken one proves nothing: its stamp may predate a jump."""
     if newest and beyond_ns > STAMPS_OFF_NS:
         clock.lost, clock.since_ns, clock.count = True, received_ns, 0
         clock.samples = clock.offset_ns = clock.bound_ns = clock.reference_ns = 0
@@ -317,7 +316,7 @@ def _is_ahead(clock: Record, beyond_ns: float, received_ns: int, newest: bool) -
 def reply(
     clock: Record, exchanges: Records, pending_ns: NDArray[np.int64], tc1_ns: int, ts1_ns: int, received_ns: int
 ) -> int:
-    """Take in a reply; returns the round trip in ns, or UNKNOWN if it answers no request or its time is impossible."""
+    """Process a reply; returns the round trip in ns, or UNKNOWN if it answers no request or its time is impossible."""
     place = _place(clock, pending_ns, ts1_ns)
     sent_ns = pending_ns[place, 1] if place >= 0 else ts1_ns
     if place < 0 or received_ns < sent_ns or tc1_ns >= LATEST_NS or tc1_ns <= -LATEST_NS:
@@ -356,11 +355,11 @@ def reply(
 
 @kernel
 def _measure_down(clock: Record, tc1_ns: int, ts1_ns: int, rtt_ns: int, before: ClockEstimate) -> None:
-    """The one-way delay of an exchange, and the largest error of the loop delays that it is used for.
+    """Set the delay down of an exchange, and the largest error of the loop delays computed from it.
 
-    If the age of a state and this delay use the same offset, its error cancels. What remains is the error of the
-    reply's stamp, the millisecond in which states are stamped, the change of the estimate between the two, and what
-    keeps either of them from being negative.
+    If the age of a state and this delay use the same offset, its error cancels. Four errors remain: that of the
+    reply's stamp, the millisecond resolution of state stamps, the change of the estimate between the two, and the
+    clipping that keeps either of them from being negative.
     """
     known = estimate_of(clock)
     down_ns = to_station_ns(known, tc1_ns) - ts1_ns
@@ -380,20 +379,20 @@ def _measure_down(clock: Record, tc1_ns: int, ts1_ns: int, rtt_ns: int, before: 
 
 @kernel
 def _stamps_off_ns(clock: Record) -> float:
-    """The largest error of a stamp."""
+    """The largest error of a stamp, for the error bound."""
     shown_ns = clock.stamp_error_ns + clock.least_ns if clock.stamp_error_ns else 0.0
     return max(float(clock.expected_error_ns), shown_ns)
 
 
 @kernel
 def _explained_ns(clock: Record) -> float:
-    """Contradictions up to this are due to stamps."""
+    """The largest contradiction that is put down to stamp errors."""
     return max(float(clock.expected_error_ns), clock.stamp_error_ns)
 
 
 @kernel
 def _doubt(clock: Record, own: Limits, gap_ns: float) -> None:
-    """Keep the limits of a doubtful exchange beside the known ones."""
+    """Keep the limits of a doubtful exchange separate from the established ones."""
     if clock.in_doubt:
         since = _limits_in(clock.limits_in_doubt)
         _set_limits(clock.limits_in_doubt, _joined(since, own, _gap_ns(since, own) <= _explained_ns(clock)))
@@ -406,7 +405,7 @@ def _doubt(clock: Record, own: Limits, gap_ns: float) -> None:
 
 @kernel
 def _fit(clock: Record, own: Limits) -> None:
-    """Narrow the limits by an exchange that fits them, which may show that earlier doubts were errors of stamps."""
+    """Tighten the limits by an exchange that fits them. It may show that earlier doubts were stamp errors."""
     clock.doubts_in_a_row = 0
     if clock.ahead_ns:
         clock.stamp_error_ns, clock.ahead_ns = _explained_ns(clock) + clock.ahead_ns, 0.0
@@ -422,9 +421,9 @@ def _fit(clock: Record, own: Limits) -> None:
 
 @kernel
 def _is_doubtful(clock: Record, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns: float) -> bool:
-    """Whether an exchange contradicts the limits, or is farther off the line than jitter explains; counts such.
+    """Whether an exchange contradicts the limits or is farther off the line than jitter explains; counts it if so.
 
-    If one way alone became slower by x, so did the round trip, and the offset is off by x / 2.
+    If the delay grows by x in one direction only, the round trip grows by x and the offset is off by x / 2.
     """
     contradicts = gap_ns > _explained_ns(clock)
     if clock.count < 2 * LEAST_SAMPLES and not contradicts:
@@ -444,9 +443,9 @@ def _is_doubtful(clock: Record, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns:
 
 @array_kernel
 def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
-    """Start over with the newest exchanges.
+    """Start over with the newest `keep` exchanges.
 
-    A change that stamps may explain is no jump while their error is not known yet: then it is taken for that error.
+    While the stamp error is still unknown, a change that it may explain is taken for that error and not for a jump.
     """
     newest = np.empty((keep, 3), np.int64)
     for k in range(keep):
@@ -470,7 +469,7 @@ def _jumped(clock: Record, exchanges: Records, ts1_ns: int, keep: int) -> None:
 
 @kernel
 def _stay_within_limits(clock: Record, at_ns: int) -> None:
-    """Move the estimate to a time, and between the limits."""
+    """Move the estimate to a time, clip it to the limits and set its bound."""
     known, limits = estimate_of(clock), _limits_in(clock.limits)
     if clock.in_doubt:
         limits = _joined(limits, _limits_in(clock.limits_in_doubt), False)
@@ -499,8 +498,8 @@ def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
     t_mean = _sum(weight * t)
     weighted = weight * (t - t_mean)
     spread = _sum(weighted * t)
-    # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
-    # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
+    # A slope fitted to a short history is noise: below 0.3 s (rms) the previous one is kept, initially 0. It is also
+    # kept if queueing, in whichever directions tilt the new line most, may tilt it by more than its uncertainty.
     skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
     if spread > 0.09e18:
         skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, _sum(weighted * y) / spread))
@@ -514,11 +513,11 @@ def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
         state_ns = clock.state_low_ns - base - skew * state_t
         low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
     ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
-    off_ns = max(0.0, _explained_ns(clock) - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
+    off_ns = max(0.0, _explained_ns(clock) - (least - ways_ns) / 2.0)  # the mean errs by the queueing of its exchanges
     if off_ns > 0.0:
         offset_ns = min(max(_sum(weight * y) - skew * t_mean, offset_ns - off_ns), offset_ns + off_ns)
         ways_ns = max(ways_ns, float(least))  # this line is only as good as the quickest exchange
-    # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
+    # The offset errs by up to half the queueing in the shortest delays; an extrapolated one also errs by its drift.
     if ways_ns > clock.ways_ns + 2.0 * ageing * (now_ns - clock.fitted_ns) + _FLOOR_NS:
         skew, offset_ns = known.skew, float(offset_at_ns(known, now_ns) - base)
     else:
@@ -531,7 +530,7 @@ def _estimate(clock: Record, exchanges: Records, now_ns: int) -> None:
 
 @array_kernel
 def _quickest(t: _Floats, y: _Floats, rtt: _Floats, skew: float, ageing: float) -> tuple[float, float]:
-    """Limits of the offset at t = 0 by the quickest way up and the quickest down; they worsen with age."""
+    """Limits of the offset at t = 0, from the shortest delay up and the shortest delay down; they widen with age."""
     offset, way, aged = y - skew * t, (0.5 + 0.5 * skew) * rtt, ageing * t
     low, high = offset - way, offset + way
     return low[(low + aged).argmax()], high[(high - aged).argmin()]
@@ -539,7 +538,7 @@ def _quickest(t: _Floats, y: _Floats, rtt: _Floats, skew: float, ageing: float) 
 
 @array_kernel
 def _sum(values: _Floats) -> float:
-    """The sum of at most 128 values in the order in which numpy adds them, whatever the processor."""
+    """The sum of at most 128 values, added in numpy's order on any processor."""
     total, whole = 0.0, len(values) - len(values) % 8
     if whole:
         part = values[:8].copy()
@@ -560,13 +559,13 @@ class Clocks(NamedTuple):
     known: Records
     """Of CLOCK, (n,)."""
     exchanges: Records
-    """Of EXCHANGES, (n, WINDOW); the newest since the last jump, not in order."""
+    """Of EXCHANGES, (n, WINDOW): a ring buffer of the newest since the last jump."""
     pending_ns: NDArray[np.int64]
-    """ts1 of the requests without a reply, and when they were sent, (n, most, 2), oldest first."""
+    """ts1 of the unanswered requests and their send times, (n, most, 2), oldest first."""
 
 
 def new_clocks(n: int) -> Clocks:
-    """Clocks of which nothing is known."""
+    """Clocks without any exchange yet."""
     known = np.zeros(n, CLOCK)
     known["rtt_ns"] = known["down_ns"] = UNKNOWN
     known["newest_boot_ns"] = known["state_low_ns"] = known["fitted_ns"] = _LONG_AGO_NS
@@ -575,9 +574,9 @@ def new_clocks(n: int) -> Clocks:
 
 
 class VehicleClock:
-    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link: a row of `Clocks`.
+    """Clock estimate and round trip of one vehicle, from its TIMESYNC exchanges: a view of one row of `Clocks`.
 
-    The comments in `CLOCK` say what its numbers are; None stands for UNKNOWN.
+    Its attributes are described by the comments in `CLOCK`; None stands for UNKNOWN.
     """
 
     samples = Cell[int]()
@@ -596,19 +595,19 @@ class VehicleClock:
 
     @property
     def exchange_due(self) -> bool:
-        """Whether a state was refused since the newest exchange, so that the next exchange must not wait."""
+        """Whether a state was refused since the newest exchange: the next exchange must not wait."""
         return bool(self._columns["lost"][self._row] or self._columns["doubtful_state"][self._row])
 
     def request(self, now_ns: int) -> int:
-        """Note a request sent now; returns its ts1, unique among the pending requests."""
+        """Record a request sent now; returns its ts1, unique among the pending requests."""
         return _request_at(self._clocks.known, self._row, self._clocks.pending_ns[self._row], now_ns)
 
     def boot_ns(self, boot_ms: int, near_ns: int) -> int:
-        """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
+        """A time_boot_ms received near a station time, as an instant of the vehicle's clock with wraps undone."""
         return boot_ns_of(self.estimate, boot_ms, near_ns)
 
     def station_ns(self, boot_ms: int, received_ns: int) -> int | None:
-        """The station's time of a time_boot_ms, not used to judge the clock; None while the clock is unknown."""
+        """A time_boot_ms in station time, without using it to judge the clock; None while the clock is unknown."""
         if not self.samples:
             return None
         known = self.estimate
@@ -620,7 +619,7 @@ class VehicleClock:
         return None if sample_ns == UNKNOWN else sample_ns
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
-        """Take in a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
+        """Process a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
         (known, exchanges, pending_ns), row = self._clocks, self._row
         rtt_ns = _reply_at(known, row, exchanges[row], pending_ns[row], tc1_ns, ts1_ns, received_ns)
         return None if rtt_ns == UNKNOWN else rtt_ns

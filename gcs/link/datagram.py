@@ -1,7 +1,7 @@
-"""Datagrams as the station receives and sends them: one by one, or many together as arrays.
+"""Datagrams as the station receives and sends them: one at a time, or in batches as arrays.
 
-Many are kept as one array of bytes and a table that says where each begins and ends. An object `bytes` is made only of
-a datagram that somebody reads.
+A batch is one array of bytes and a table of where each datagram begins and ends. A `bytes` object is made only for a
+datagram that is read individually.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +14,7 @@ from scenarios.kernel import Array, kernel
 from scenarios.sockets import Bytes, Ints, joined
 
 Address = tuple[str, int, int]
-"""Host and port, and the network: the number of the station's socket that this address sends to."""
+"""Host, port and network, which is the number of the station's socket that this address sends to."""
 
 
 class Datagram(NamedTuple):
@@ -23,23 +23,23 @@ class Datagram(NamedTuple):
     data: bytes
     address: Address
     received_ns: int
-    """The kernel's stamp, on the station's clock."""
+    """The operating system's receive timestamp, on the station's clock."""
     queued_ns: int = 0
     """Time it waited in the socket buffer before the station read it."""
 
 
 Outgoing = tuple[bytes, Address]
-"""One datagram to be sent, and to whom."""
+"""One datagram to be sent, and its destination."""
 Logged = tuple[bytes, int, Address]
-"""A frame, when it was received or sent, and from or to whom."""
+"""A frame, its receive or send time in ns, and its source or destination."""
 
 
 @dataclass(slots=True)
 class Arrivals:
-    """Datagrams received, or sent; whoever iterates over them gets objects.
+    """A batch of received or sent datagrams; iterating over it yields `Datagram` objects.
 
-    The rows of `table` (4, n) say of each where it begins and ends in `stream`, which of `addresses` it is from or to,
-    and when it was received or sent.
+    The rows of `table` (4, n): where each begins and ends in `stream`, the index of its source or destination in
+    `addresses`, and its receive or send time.
     """
 
     stream: Bytes
@@ -60,7 +60,7 @@ class Arrivals:
 
 
 def arrivals_of(datagrams: Sequence[Datagram]) -> Arrivals:
-    """The same datagrams as arrays."""
+    """The batch that holds these datagrams."""
     data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True) if datagrams else ((), (), (), ())
     senders = {address: place for place, address in enumerate(dict.fromkeys(addresses))}
     stream, ends = joined(data)
@@ -69,7 +69,7 @@ def arrivals_of(datagrams: Sequence[Datagram]) -> Arrivals:
 
 
 class Frames:
-    """Frames received or sent, in order, until they are cleared."""
+    """A log buffer of frames received or sent, in order."""
 
     def __init__(self, frames: Iterable[Logged] = ()) -> None:
         self.parts: list[Logged | Arrivals] = [*frames]
@@ -78,13 +78,13 @@ class Frames:
         self.parts.append(frame)
 
     def add(self, arrivals: Arrivals, first: int = 0, stop: int | None = None) -> None:
-        """Add the datagrams from the place `first` up to `stop`, each of one frame."""
+        """Add the datagrams from index `first` up to `stop`; each must hold one frame."""
         table = arrivals.table[:, first:stop]
         if table.shape[1]:
             self.parts.append(replace(arrivals, table=table))
 
     def take(self, other: "Frames") -> None:
-        """Add all frames of another, which has none then."""
+        """Move all frames of another buffer into this one."""
         self.parts += other.parts
         other.clear()
 
@@ -102,7 +102,7 @@ class Frames:
 
 @dataclass(slots=True)
 class Block:
-    """Frames to many vehicles: frame k is the first `sizes[k]` bytes of `frames[k]`, to the vehicle `rows[k]`.
+    """Frames to many vehicles: frame k is the first `sizes[k]` bytes of `frames[k]` and goes to the vehicle `rows[k]`.
 
     `to` holds the addresses of all vehicles.
     """
@@ -114,7 +114,7 @@ class Block:
 
 
 class Outbox:
-    """Datagrams to be sent, in order. Iterating over it gives (bytes, address) of each."""
+    """Queue of datagrams to be sent. Iterating over it yields (bytes, address) of each."""
 
     def __init__(self, parts: Sequence[Outgoing] = ()) -> None:
         self.parts: list[Outgoing | Block] = [*parts]
@@ -131,9 +131,9 @@ class Outbox:
     def packed(
         self, number: Callable[[Address], int], numbers: Callable[[Sequence[Address | None]], Ints]
     ) -> tuple[Bytes, Ints]:
-        """Its datagrams as the stream and the table of `Arrivals`, not yet sent: with 0 for the times.
+        """Its datagrams as the stream and the table of `Arrivals`, with times 0 because they are not yet sent.
 
-        `number` and `numbers` give the numbers of one address and of the addresses of all vehicles.
+        `number` maps one address to its number, `numbers` the addresses of all vehicles to theirs.
         """
         table, streams = np.zeros((4, len(self)), np.int64), [np.empty(0, np.uint8)]
         place = begin = 0
@@ -167,7 +167,7 @@ class Outbox:
 
 @kernel
 def _enter(table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, numbers: Array) -> None:
-    """Enter frames of a width each, the first of which begins at `begin`, into a table of datagrams."""
+    """Enter frames, one every `width` bytes from `begin` on, into a table of datagrams."""
     for k in range(len(rows)):
         table[0, place + k] = begin + k * width
         table[1, place + k] = begin + k * width + sizes[k]

@@ -1,4 +1,4 @@
-"""What the conversation with a vehicle depends on: its kind, as data."""
+"""The kinds of vehicle, as data: modes and traits on which the conversation with a vehicle depends."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -15,7 +15,7 @@ Command = tuple[int, tuple[float, ...]]
 
 
 class Goal(Enum):
-    """What the station wants of a vehicle."""
+    """The state to which the station brings a vehicle."""
 
     FLY = "take set-points"
     END = "hold or land by itself"
@@ -29,42 +29,42 @@ class Kind:
     guided_mode: int
     """The mode in which it takes set-points."""
     hold_mode: int
-    """The mode in which it stays where it is, without a pilot."""
+    """The mode in which it holds its position without a pilot."""
     land_mode: int
     take_off_mode: int = -1
     """The mode in which it takes off and then holds; -1 if that is the guided mode."""
     guided_name: str = "GUIDED"
     estimator_message: int = 0
-    """The message that says whether the vehicle knows its position."""
+    """The message that reports whether the vehicle knows its position."""
     piloted: bool = True
-    """It may leave the guided mode because a pilot, or the autopilot itself, wants something else."""
+    """A pilot, or the autopilot itself, may take it out of the guided mode."""
     guided_first: bool = True
     """It becomes guided on the ground, before it is armed; otherwise only in the air, while set-points arrive."""
     altitude_above_sea: bool = False
     """Its take-off command takes an altitude above sea level, not above home."""
     stays_guided: bool = False
-    """Without set-points it stops but stays guided. If it leaves the guided mode, somebody wanted that."""
+    """Without set-points it stops but stays guided, so leaving the guided mode is always somebody's choice."""
     velocity_grows: bool = False
     """Between set-points its velocity target grows with the acceleration."""
     timesync_error_ns: int = 0
-    """The usual largest error of the stamps in its TIMESYNC replies."""
+    """The largest usual error of the stamps in its TIMESYNC replies."""
     packed_modes: bool = False
-    """A mode has a main and a sub number: two parameters of DO_SET_MODE, packed into one number in HEARTBEAT."""
+    """A mode has a main and a sub number: two parameters in DO_SET_MODE, packed into one number in HEARTBEAT."""
 
 
 LAUNCHED = Kind("launched UAV", guided_mode=4, hold_mode=5, land_mode=5, piloted=False)
 """The simulated double integrators."""
 UNRECOGNISED = replace(LAUNCHED, name="unrecognised vehicle", piloted=True)
-"""A vehicle with an autopilot before its heartbeat has shown which."""
+"""A vehicle with an autopilot whose heartbeat has not yet shown which one it is."""
 
 
 def packed(main: int, sub: int = 0) -> int:
-    """A main and a sub mode as HEARTBEAT.custom_mode holds them."""
+    """The HEARTBEAT.custom_mode of a main and a sub mode."""
     return main << 16 | sub << 24
 
 
 def mode_command(kind: Kind, custom_mode: int) -> Command:
-    """DO_SET_MODE with its parameters."""
+    """The DO_SET_MODE command that selects a custom mode."""
     if not kind.packed_modes:
         return SET_MODE, (CUSTOM_MODE_ENABLED, float(custom_mode))
     return SET_MODE, (CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24))
@@ -76,7 +76,7 @@ def commanded_mode(kind: Kind, parameters: tuple[float, ...]) -> int:
 
 
 class Step(NamedTuple):
-    """What a vehicle still lacks ("" if nothing), and the command that may bring it; None to wait."""
+    """What a vehicle still lacks ("" if nothing), and the command that may provide it (None: wait)."""
 
     missing: str
     command: Command | None = None

@@ -1,8 +1,8 @@
-"""The station's MAVLink 2 codec: frames from and to datagrams.
+"""The station's MAVLink 2 codec: decodes datagrams into frames and encodes frames.
 
 Message definitions (wire layout, CRC_EXTRA) come from pymavlink's dialect. Framing and checksum are our own, because
-they run for 25,000 datagrams a second with 250 vehicles. Fields are in wire order. The kernels at the end read and make
-the three messages of which nearly all traffic consists, in the same layout.
+they run for 25,000 datagrams a second with 250 vehicles. Fields are in wire order. The kernels at the end read and
+write the few messages that make up nearly all traffic, in the same layout.
 """
 
 import struct
@@ -57,7 +57,7 @@ class _Layout(NamedTuple):
 
 
 SETUP_SIGNING = 256
-"""Carries a key, so it is neither sent nor accepted, and never logged."""
+"""This message carries a key, so it is neither sent nor accepted, and never logged."""
 _MESSAGES: dict[int, Any] = dialect.mavlink_map
 _LAYOUTS = {
     msg_id: _Layout(
@@ -74,7 +74,7 @@ _TARGET_PLACES = {
     for msg_id, message in _MESSAGES.items()
     if "target_system" in message.ordered_fieldnames
 }
-"""Position of target_system among the fields of each message that has one."""
+"""Index of target_system among the fields, for each message that has one."""
 CRC_EXTRA = {msg_id: layout.crc_extra for msg_id, layout in _LAYOUTS.items()}
 
 
@@ -90,7 +90,7 @@ class Frame(NamedTuple):
 
 
 def named_fields(frame: Frame) -> dict[str, Any]:
-    """The fields by their names: an array as a list, characters as a text."""
+    """The fields by name, with arrays as lists and characters as a string."""
     message = _MESSAGES[frame.msg_id]
     named: dict[str, Any] = {}
     at = 0
@@ -131,12 +131,12 @@ def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 
 
 def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid frames of one datagram, which holds either MAVLink 1 or MAVLink 2."""
+    """The valid frames of one datagram, which may hold MAVLink 1 or MAVLink 2."""
     return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
 
 
 def in_network(frames: list[Frame], network: int) -> list[Frame]:
-    """Frames received in a network, with the system ids of `scenarios.networks`."""
+    """Frames received in a network, with their system ids replaced by those of `scenarios.networks`."""
     return [frame._replace(system_id=system_id_of(network, frame.system_id)) for frame in frames] if network else frames
 
 
@@ -162,14 +162,14 @@ def _decode(datagram: bytes, magic: int, refused: Counter[str]) -> list[Frame]:
 
 
 def is_magic(data: bytes, at: int) -> bool:
-    """Whether a frame may begin at this place, or the data end there."""
+    """Whether a frame may begin at this index, or the data end there."""
     return at >= len(data) or data[at] in (MAGIC, MAGIC_1)
 
 
 def frame_end(data: bytes, at: int) -> int:
-    """Where the frame that begins at this place ends; 0 if none begins there or it is truncated.
+    """The end of the frame that begins at this index; 0 if none begins there or it is truncated.
 
-    This is the only function that computes a frame's length. Decoders call it before they read past the magic byte.
+    Decoders call it before they read past the magic byte. Only it computes the length of a frame that may be signed.
     """
     if at + _OVERHEAD_1 > len(data) or data[at] not in (MAGIC, MAGIC_1):
         return 0
@@ -179,7 +179,7 @@ def frame_end(data: bytes, at: int) -> int:
 
 
 def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
-    """One frame of the right length, or None if it is refused."""
+    """Decode one frame whose length has been checked; None if it is refused."""
     if data[0] == MAGIC:
         _, length, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
         msg_id, begin = id_low | id_high << 16, _HEADER.size
@@ -251,14 +251,14 @@ def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07
 IGNORE_ALL_BUT_ACCELERATION = 0x0C3F
 VELOCITY_IGNORED = 0x0018
-"""type_mask values: each bit set makes the vehicle ignore a field."""
+"""Values of type_mask, in which each set bit makes the vehicle ignore a field."""
 
 
 _LOCAL_FRAME = dialect.MAV_FRAME_LOCAL_NED
 SET_POINT = np.dtype(
     [("sent", "?"), ("type_mask", "u2"), ("velocity_ned_m_s", "f8", (3,)), ("acceleration_ne_m_s2", "f8", (2,))]
 )
-"""What a vehicle is sent as SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED; `sent`: whether it is sent one."""
+"""A set-point: SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED; `sent`: whether the vehicle is sent one."""
 _TIMESYNC_BYTES = _LAYOUTS[TIMESYNC].length
 _SET_POINT_BYTES = _LAYOUTS[SET_POSITION_TARGET_LOCAL_NED].length
 _HEADER_BYTES = _HEADER.size
@@ -268,8 +268,8 @@ HEARTBEAT_EXTRA, _GLOBAL_EXTRA = CRC_EXTRA[HEARTBEAT][0], CRC_EXTRA[GLOBAL_POSIT
 
 
 _CRC, _rest = np.empty((4, 256), np.uint16), np.arange(256)
-"""Row k: what a byte with k more behind it adds to the checksum, CRC-16/MCRF4XX with its polynomial 0x8408. Short
-numbers: a kernel holds them as text."""
+"""Lookup tables of CRC-16/MCRF4XX, polynomial 0x8408: row k holds the contribution of a byte followed by k more. The
+type is short because a kernel embeds the table as text in its code."""
 for _row in _CRC:
     for _bit in range(8):
         _rest = _rest >> 1 ^ 0x8408 * (_rest & 1)
@@ -278,9 +278,9 @@ for _row in _CRC:
 
 @kernel
 def checksum(data: Array, begin: int, end: int, extra: int) -> int:
-    """The checksum of a frame whose bytes from its length to its payload are given."""
+    """The checksum of a frame, over its bytes from the length field to the end of the payload, and CRC_EXTRA."""
     crc, fours = 0xFFFF, begin + (end - begin) // 4 * 4
-    for k in range(begin, fours, 4):  # the four lookups do not wait for one another
+    for k in range(begin, fours, 4):  # the four lookups are independent of one another
         ahead = _CRC[3, (crc ^ data[k]) & 0xFF] ^ _CRC[2, (crc >> 8 ^ data[k + 1]) & 0xFF]
         crc = int64(ahead ^ _CRC[1, data[k + 2]] ^ _CRC[0, data[k + 3]])
     for k in range(fours, end):
@@ -290,9 +290,9 @@ def checksum(data: Array, begin: int, end: int, extra: int) -> int:
 
 @kernel
 def usual_message(data: Array, begin: int, end: int) -> int:
-    """The id of the message in a datagram that holds one valid, unsigned frame of a usual message; else -1.
+    """The message id of a datagram that holds exactly one valid, unsigned frame of a usual message; else -1.
 
-    Usual are LOCAL_POSITION_NED, TIMESYNC, HEARTBEAT and GLOBAL_POSITION_INT.
+    Usual messages are LOCAL_POSITION_NED, TIMESYNC, HEARTBEAT and GLOBAL_POSITION_INT.
     """
     if end - begin < _OVERHEAD or data[begin] != MAGIC or data[begin + 2] or end - begin != _OVERHEAD + data[begin + 1]:
         return -1
@@ -315,7 +315,7 @@ def usual_message(data: Array, begin: int, end: int) -> int:
 
 @kernel
 def unsigned_at(data: Array, place: int, size: int, end: int) -> Any:
-    """An unsigned number of so many bytes; those from `end` on count as zeros, which MAVLink 2 omits."""
+    """The unsigned integer of `size` bytes at an index; bytes from `end` on are zeros, which MAVLink 2 omits."""
     value = np.uint64(0)
     for k in range(min(size, end - place)):
         value |= np.uint64(data[place + k]) << np.uint64(8 * k)
@@ -324,7 +324,7 @@ def unsigned_at(data: Array, place: int, size: int, end: int) -> Any:
 
 @kernel
 def float_at(data: Array, place: int, end: int) -> float:
-    """A float32 at a place, as `unsigned_at`."""
+    """The float32 at an index, read as by `unsigned_at`."""
     return np.float64(np.uint32(unsigned_at(data, place, 4, end)).view(np.float32))
 
 
@@ -341,10 +341,10 @@ def _put_float(data: Array, place: int, value: float) -> None:
 
 @array_kernel
 def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Array, key_ms: int) -> NDArray[np.uint8]:
-    """The frames (m, bytes) of the set-points of some vehicles, each numbered in a sequence of its own.
+    """Set-point frames (m, bytes) for some vehicles, each with its own sequence numbers.
 
-    `points` (SET_POINT), `sequences` and `targets` (their ids in frames) are those of all vehicles; `sequences` is
-    advanced. The last byte of a payload is the frame, never zero, so all are of one length.
+    `points` (SET_POINT), `sequences` and `targets` (their system ids on the wire) are those of all vehicles;
+    `sequences` is advanced. The last payload byte, the coordinate frame, is never zero, so all have the same length.
     """
     end = _HEADER_BYTES + _SET_POINT_BYTES
     frames = np.zeros((len(rows), end + 2), np.uint8)
@@ -367,7 +367,7 @@ def set_point_frames(points: Records, rows: Array, sequences: Array, targets: Ar
 
 @array_kernel
 def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDArray[np.uint8]:
-    """Copies (m, bytes) of a frame for some vehicles, each numbered in a sequence of its own.
+    """Copies (m, bytes) of a frame for some vehicles, each with its own sequence numbers.
 
     `extra` is the CRC_EXTRA byte of the message.
     """
@@ -375,7 +375,7 @@ def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDAr
     frames = np.empty((len(rows), size), np.uint8)
     for place in range(len(rows)):
         row, own = rows[place], frames[place]
-        for k in range(size):  # `own[:] = frame` would bring two seconds of compilation for its error message
+        for k in range(size):  # `own[:] = frame` would take two seconds longer to compile, for its error message
             own[k] = frame[k]
         own[4] = sequences[row] = (sequences[row] + 1) & 0xFF
         _put(own, size - 2, np.uint64(checksum(own, 1, size - 2, extra)), 2)
@@ -387,7 +387,7 @@ TIMESYNC_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES
 
 @kernel
 def encode_timesync(data: Array, tc1_ns: int, ts1_ns: int, sequence: int) -> int:
-    """Write the frame of a TIMESYNC, a request if tc1 is 0, into `TIMESYNC_FRAME_BYTES` zeros; returns its length."""
+    """Write a TIMESYNC frame (a request if tc1 is 0) into `TIMESYNC_FRAME_BYTES` zeros; returns its length."""
     _put(data, _HEADER_BYTES, np.uint64(tc1_ns), 8)
     _put(data, _HEADER_BYTES + 8, np.uint64(ts1_ns), 8)
     end = len(data) - 2

@@ -1,4 +1,4 @@
-"""Loss, lateness and duplication from MAVLink's 8-bit sequence numbers."""
+"""Counts lost, late and duplicate frames by MAVLink's 8-bit sequence numbers."""
 
 import numpy as np
 
@@ -11,30 +11,30 @@ NEW, LATE, DUPLICATE = 0, 1, 2
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
 _RATE_NS = NS_PER_S
-"""The rate is measured over intervals of this length, each weighted less than the next by the factor below. To count
-the losses of a minute's outage correctly, the rate must be known to about half a per cent, whatever the jitter."""
+"""The frame rate is measured over intervals of this length, weighted by the factor below for each interval of age. To
+count the losses of a minute's outage correctly, it must be known to about half a per cent, whatever the jitter."""
 _OLDER = 0.9
 _AHEAD, _LEAST_AHEAD = 127, 32
-"""A frame may be this much newer than its time suggests, because the newest one may itself have been late. The farther
-frames have lately been overtaken, the smaller this allowance is, down to the second figure."""
+"""A frame may be this many numbers newer than its time suggests, because the newest one may itself have been late. The
+farther frames have recently been overtaken, the smaller this allowance, down to the second figure."""
 _MOST = 0xFFFFFFFF
-"""The largest count that the tick record holds: a log whose clock jumps by centuries seems to have lost more."""
+"""The largest count that the tick record holds; a log whose clock jumps by centuries would exceed it."""
 _FORGET = 1.0 / 512
 _LONGEST = 9e18
-"""Expected frames times ns beyond which it makes no difference how many: more than `_MOST` are lost."""
+"""Upper limit of expected frames times 1e9; beyond it more than `_MOST` are lost, so their number does not matter."""
 _RUN, _RUN_STEP = 8, 4
-"""This many late frames in a row, each newer than the last by at most the second figure, are new after all: an
-earlier, very late frame was taken for a new one."""
+"""This many late frames in a row, each at most the second figure newer than the last, are new after all: an earlier,
+very late frame was mistaken for a new one."""
 
 
 COUNTER = np.dtype(
     [
         ("received", "i8"), ("lost", "i8"), ("late", "i8"), ("duplicate", "i8"),
         ("last", "i8"),  # sequence number of the last frame
-        ("newest", "i8"), ("newest_ns", "i8"),  # number of the newest frame, wraps undone; -1 before the first
-        ("seen", "u8"), ("seen_before", "u8"),  # bit k: frame number newest - k has arrived, and newest - 64 - k
+        ("newest", "i8"), ("newest_ns", "i8"),  # newest frame: its number, wraps undone (-1: none yet), and its time
+        ("seen", "u8"), ("seen_before", "u8"),  # bit k is set if frame newest - k, or newest - 64 - k, has arrived
         ("run", "i8"),  # late frames in a row, each a little newer than the last
-        ("lag", "f8"),  # how far frames have lately been overtaken
+        ("lag", "f8"),  # by how many numbers frames have recently been overtaken
         ("rate_hz", "f8"), ("rate_count", "i8"), ("rate_ns", "i8"), ("steady_frames", "f8"), ("steady_ns", "f8"),
     ],
     align=True,
@@ -61,7 +61,7 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
     if ahead <= 0 and 0 < step <= _RUN_STEP:
         counter.run += 1
         if counter.run == _RUN:
-            counter.lost -= ahead + 255  # nobody knows whether any of these are lost
+            counter.lost -= ahead + 255  # whether any of these are lost is unknown
             ahead += 256
     else:
         counter.run = 0
@@ -91,7 +91,7 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
 
 @kernel
 def restart(counter: Record) -> None:
-    """Take the next frame as the first: the sender has restarted."""
+    """Treat the next frame as the first: the sender has restarted."""
     counter.newest = -1
     counter.newest_ns = counter.rate_ns = counter.rate_count = counter.run = counter.last = 0
     counter.seen = counter.seen_before = 0
@@ -100,7 +100,7 @@ def restart(counter: Record) -> None:
 
 @kernel
 def _see_next(counter: Record, ahead: int) -> None:
-    """Note the arrival of the frame that is so many numbers newer than the newest."""
+    """Record the arrival of the frame that is `ahead` numbers newer than the newest."""
     counter.newest += ahead
     if ahead >= _KEPT:
         counter.seen = counter.seen_before = 0
@@ -116,7 +116,7 @@ def _see_next(counter: Record, ahead: int) -> None:
 
 @kernel
 def _note_rate(counter: Record, time_ns: int) -> None:
-    """Update the rate of frames sent, from times without a pause."""
+    """Update the sender's frame rate, leaving out intervals with a pause."""
     steady = time_ns - counter.newest_ns < _STEADY_NS
     since_ns = time_ns - counter.rate_ns
     if steady and since_ns < _RATE_NS:
@@ -132,7 +132,7 @@ _count_at, _restart_at = at_row(count), at_row(restart)
 
 
 def new_counters(n: int) -> Records:
-    """Counters of `COUNTER` for n senders that have sent nothing."""
+    """Counters (of `COUNTER`) for n senders that have sent nothing yet."""
     counters = np.zeros(n, COUNTER)
     counters["newest"] = -1
     return counters
@@ -143,8 +143,8 @@ class SequenceCounter:
 
     A sequence number holds 8 bits of the count; time gives the rest. A frame can be only slightly newer than the frame
     rate suggests; one that seems newer than that is an old one. So a swapped pair is one late frame, not 254 lost ones,
-    and the losses of an outage of a minute are counted in full. A frame overtaken by more than 223 others is
-    miscounted. A late frame no longer counts as lost.
+    and all losses of a minute's outage are counted. A frame overtaken by more than 223 others is miscounted. A late
+    frame is no longer counted as lost once it arrives.
     """
 
     received = Cell[int]()
@@ -153,7 +153,7 @@ class SequenceCounter:
     duplicate = Cell[int]()
 
     def __init__(self, counters: Records = None, row: int = 0) -> None:
-        """The counter in a row of an array of `COUNTER`."""
+        """A view of one row of an array of `COUNTER`, by default of an array of its own."""
         self._counters, self._row = new_counters(1) if counters is None else counters, row
         self._columns = Columns(self._counters)
 
@@ -162,5 +162,5 @@ class SequenceCounter:
         return _count_at(self._counters, self._row, sequence, time_ns)
 
     def restart(self) -> None:
-        """Take the next frame as the first: the sender has restarted."""
+        """Treat the next frame as the first: the sender has restarted."""
         _restart_at(self._counters, self._row)

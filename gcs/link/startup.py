@@ -1,6 +1,6 @@
-"""The start-up of one vehicle: what it lacks until it can be flown, and the message to send next.
+"""The start-up of one vehicle: what it still lacks before it can be flown, and the message to send next.
 
-`gcs.autopilot.startup` has that of vehicles with an autopilot.
+`gcs.autopilot.startup` holds the start-up of vehicles with an autopilot.
 """
 
 from typing import Any, Protocol
@@ -10,26 +10,26 @@ from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Kind, Ste
 from gcs.link.upload import Upload
 
 OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
-"""The message without which a vehicle can be flown: prediction then assumes that every set-point acts."""
+"""The message that a vehicle may refuse to send: prediction then assumes that every set-point acts."""
 WITHOUT_TARGET = "does not report its active target"
-"""The event of a vehicle that refuses this message."""
+"""The event text for a vehicle that refuses it."""
 
 
 def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:
-    """The interval in µs of each message that is sent, as parameters of a command; vehicles take whole numbers."""
+    """Message id to interval in µs, rounded as vehicles require, for SET_MESSAGE_INTERVAL; rates of 0 are left out."""
     return {float(message): float(round(1e6 / hz)) for message, hz in rates_hz.items() if hz}
 
 
 class Startup(Protocol):
-    """The part of the conversation with a vehicle that depends on its kind; each kind inherits this."""
+    """Base class of the part of the conversation that depends on the kind of vehicle."""
 
     kind: Kind
     refusal: str = ""
     """Why the vehicle must not be flown; empty if it may."""
     has_landed: bool = False
-    """Whether it has been in the air in this flight and is on the ground again."""
+    """Whether it has been in the air in this flight and is back on the ground."""
     arming_refusals: int = 0
-    """How often it has refused to arm since it was armed last."""
+    """Number of refusals to arm since it was last armed."""
 
     @property
     def is_half_way_up(self) -> bool:
@@ -37,22 +37,22 @@ class Startup(Protocol):
         return False
 
     def is_news(self, text: str) -> bool:  # noqa: ARG002 - most vehicles seldom speak
-        """Whether a text from the vehicle is new, not one that it only repeats."""
+        """Whether a text from the vehicle is new, not a repetition."""
         return True
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
-        """The kind of vehicle, as far as its heartbeats show it."""
+        """The kind of vehicle that its heartbeats have shown so far."""
         ...
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        """Take in a message from the vehicle; only some concern the start-up."""
+        """Process a message from the vehicle; most do not concern the start-up."""
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
-        """The next step towards a vehicle that takes set-points."""
+        """The next step towards taking set-points."""
         ...
 
     def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """Message id and fields of the parameter message that is due, if one is."""
+        """Message id and fields of the parameter message that is due, if any."""
         ...
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
@@ -61,7 +61,7 @@ class Startup(Protocol):
 
 
 class LaunchedStartup(Startup):
-    """Start-up of a double integrator: telemetry rate, parameters of the loop on board if any, GUIDED, armed."""
+    """Start-up of a double integrator: message rates, parameters of the loop on board if any, GUIDED, arming."""
 
     kind = LAUNCHED
 
@@ -108,7 +108,7 @@ class LaunchedStartup(Startup):
             self._set.add(parameters[0])
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:  # noqa: ARG002
-        """Go on without the active target, which is optional; any other step is tried again."""
+        """Continue without the active target, which is optional; any other step is retried."""
         if command == SET_MESSAGE_INTERVAL and parameters[0] == OPTIONAL:
             self._set.add(parameters[0])
 

@@ -1,7 +1,7 @@
-"""Parameters of one vehicle: uploaded, read back and compared before it may be armed.
+"""Parameter upload to one vehicle: parameters are set, read back and compared before the vehicle may be armed.
 
-A vehicle answers PARAM_SET with PARAM_VALUE, the value that then holds. Once all are set, each is read back with
-PARAM_REQUEST_READ. Unanswered messages are repeated. Links may be slow, so many parameters are sent at once.
+A vehicle answers PARAM_SET with PARAM_VALUE, the value now in effect. Once all are set, each is read back with
+PARAM_REQUEST_READ. Unanswered messages are resent. Links may be slow, so many parameters may be in flight at once.
 """
 
 import struct
@@ -12,9 +12,9 @@ from typing import Any
 from gcs.link import mavlink
 
 PATIENCE_NS = 1_000_000_000
-"""An answer may take this long or three round trips, whichever is longer."""
+"""Timeout of an answer, or three round trips if that is longer."""
 ATTEMPTS = 3
-"""A vehicle is refused at its third wrong value: the first may have been on its way before the value was set."""
+"""A parameter's third wrong value refuses the vehicle: the first may have been sent before the value was set."""
 _LONG_AGO_NS = -(1 << 62)
 _FLOAT = struct.Struct("<f")
 
@@ -28,25 +28,25 @@ class _Stage(IntEnum):
 @dataclass
 class _Item:
     value: float
-    """As float32, as it travels."""
+    """Rounded to float32, as it is transmitted."""
     stage: _Stage = _Stage.TO_SET
     sent_ns: int = _LONG_AGO_NS
     wrong: int = 0
 
 
 class Upload:
-    """The parameters that one vehicle is to hold; `next` and `take` bring it there."""
+    """The upload of one vehicle's parameters: `next` gives the frame to send, `take` processes an answer."""
 
     def __init__(self, wanted: dict[str, float]) -> None:
         self._items = {name: _Item(float32(value)) for name, value in wanted.items()}
         self.done = not wanted
-        """Whether every parameter has been read back and is right."""
+        """Whether every parameter has been read back and is correct."""
         self.refusal = ""
         """Why the vehicle must not be armed; empty if it may."""
 
     @property
     def missing(self) -> str:
-        """What keeps the upload from being complete, in words."""
+        """Why the upload is not complete, in words; empty if it is."""
         for name, item in self._items.items():
             if item.stage is not _Stage.COMPARED:
                 return self.refusal or f"does not answer to parameter {name}"
@@ -59,7 +59,7 @@ class Upload:
             item.stage, item.sent_ns = _Stage.TO_SET, _LONG_AGO_NS
 
     def next(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """Message id and fields of the frame that is due, if any. All parameters are set before any is read back."""
+        """Message id and fields of the message that is due, if any. All parameters are set before any is read back."""
         if self.done or self.refusal:
             return None
         stage = min(item.stage for item in self._items.values())
@@ -78,7 +78,7 @@ class Upload:
         item = self._items.get(name)
         if item is None or item.sent_ns == _LONG_AGO_NS or item.stage is _Stage.COMPARED:
             return
-        item.sent_ns = _LONG_AGO_NS  # its next message is due at once
+        item.sent_ns = _LONG_AGO_NS  # makes its next message due at once
         if value == item.value:
             item.stage = _Stage(item.stage + 1)
             self.done = all(other.stage is _Stage.COMPARED for other in self._items.values())
@@ -90,6 +90,6 @@ class Upload:
 
 
 def float32(value: float) -> float:
-    """The number as it arrives in a MAVLink float."""
+    """The number rounded to a MAVLink float."""
     rounded: float = _FLOAT.unpack(_FLOAT.pack(value))[0]
     return rounded

@@ -1,4 +1,4 @@
-"""What the station knows of one vehicle, and its conversation with it: heartbeats, pilots, commands."""
+"""The station's state of one vehicle and its conversation with it: heartbeats, pilots, commands."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,38 +47,38 @@ STATE_CRITICAL = 5
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
 _NOBODY = -1
-"""In place of the number of an address."""
+"""Stands for the number of an unknown address."""
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
 FORGET_NUMBERS_NS = 3 * NS_PER_S
 SILENCE_S = 1.5
-"""A vehicle without telemetry for this long is lost: it is sent no more set-points, and the others fly without it. One
-that sends nothing at all for this long may be accepted from another address."""
+"""A vehicle without telemetry for this long is lost: it gets no more set-points, and the others fly without it. One
+that sends nothing at all for this long may come back from another address."""
 _SILENT_NS = 3 * NS_PER_S
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
 
 
 LINK = np.dtype(
     [
-        ("address", "i8"),  # place among `Links.addresses`, or _NOBODY
-        ("heard_ns", "i8"),  # newest valid frame
-        ("first_heard_ns", "i8"),  # first one, or 0
-        ("launched", "?"),  # it has no autopilot, so that only changes of its heartbeats matter, and no global position
-        ("heartbeat_ns", "i8"),  # newest heartbeat
+        ("address", "i8"),  # its number in `Links.addresses`, or _NOBODY
+        ("heard_ns", "i8"),  # when the newest valid frame arrived
+        ("first_heard_ns", "i8"),  # when the first one arrived, or 0
+        ("launched", "?"),  # it has no autopilot: only changes of its heartbeats matter, and it has no global position
+        ("heartbeat_ns", "i8"),  # when the newest heartbeat arrived
         ("heartbeat", "u8"),  # the first 8 bytes of a heartbeat that would change nothing; 0: none
-        ("newest", "?"),  # the last frame taken in was sent after all the others
-        ("told", "i8"),  # bits of what was reported of the order of its frames: 1 << LATE, 1 << DUPLICATE
+        ("newest", "?"),  # the last frame processed was sent after all the others
+        ("told", "i8"),  # frame-order faults already reported, as bits 1 << LATE and 1 << DUPLICATE
         ("left_out", "?"),  # see `RemoteVehicle`
         ("sequence", "i8"),  # of the last frame sent to it
-        ("lag_ms", "i8"),  # the reported lag of held set-points, and how often the clock had jumped by then; -1: never
-        ("lag_jumps", "i8"),
-        ("local_ms", "i8"),
-        ("local", "f8", (6,)),  # its newest LOCAL_POSITION_NED, and whether it has sent one since
-        ("local_is_new", "?"),  # the start-up was last told of it
+        ("lag_ms", "i8"),  # reported lag after which held set-points act
+        ("lag_jumps", "i8"),  # clock jumps counted when it was reported; -1: never reported
+        ("local_ms", "i8"),  # time_boot_ms of its newest LOCAL_POSITION_NED
+        ("local", "f8", (6,)),  # position and velocity in it
+        ("local_is_new", "?"),  # the start-up has not yet been told of it
     ],
     align=True,
 )
-"""What every frame from or to one vehicle changes."""
+"""Per-vehicle state that every received or sent frame may change."""
 
 
 class Links(NamedTuple):
@@ -89,34 +89,34 @@ class Links(NamedTuple):
     clocks: Clocks
     counters: Records
     addresses: dict[Address, int]
-    """A number for each address that vehicles have sent from."""
+    """The number of each address from which vehicles have sent."""
     to: list[Address | None]
     """The address of each vehicle."""
 
 
 def new_links(n: int) -> Links:
-    """Links over which nothing has been heard."""
+    """Links over which nothing has been received yet."""
     known = np.zeros(n, LINK)
     known["address"], known["newest"], known["lag_jumps"] = _NOBODY, True, -1
     return Links(known, new_clocks(n), new_counters(n), {}, [None] * n)
 
 
 def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key_ms: int) -> Block:
-    """Set-points to the vehicles that are sent one and have been heard; see `gcs.link.mavlink.set_point_frames`."""
+    """Set-points, as of `gcs.link.mavlink.set_point_frames`, to those marked `sent` whose vehicle has been heard."""
     rows = heard(links.known, points["sent"])
     frames = mavlink.set_point_frames(points, rows, links.known["sequence"], targets, key_ms)
     return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
 
 
 def heartbeats_to(links: Links) -> Block:
-    """A HEARTBEAT of the station to all vehicles that have been heard."""
+    """A HEARTBEAT from the station to each vehicle that has been heard."""
     rows = heard(links.known, np.ones(len(links.to), np.bool_))
     frames = mavlink.same_frames(HEARTBEAT, mavlink.HEARTBEAT_EXTRA, rows, links.known["sequence"])
     return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
 
 
 def note_requests(links: Links, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
-    """Note when the TIMESYNC requests among the datagrams of a step were sent: round trips count from then."""
+    """Record the send times of the TIMESYNC requests among a step's datagrams: round trips are measured from them."""
     place = 0
     for part in outbox.parts:
         count = len(part.rows) if isinstance(part, Block) else 1
@@ -127,7 +127,7 @@ def note_requests(links: Links, outbox: Outbox, sent_ns: NDArray[np.int64]) -> N
 
 @array_kernel
 def heard(known: Records, wanted: Array) -> NDArray[np.int64]:
-    """The rows that are wanted and whose vehicles have been heard."""
+    """The wanted rows whose vehicles have been heard."""
     rows, found = np.empty(len(known), np.int64), 0
     for row in range(len(known)):
         if wanted[row] and known[row].address != _NOBODY:
@@ -140,7 +140,7 @@ def heard(known: Records, wanted: Array) -> NDArray[np.int64]:
 def ask(
     known: Records, clocks: Records, pending_ns: Array, first: int, count: int, now_ns: int
 ) -> tuple[Array, Array, Array]:
-    """Note the requests; returns their frames, the sizes of these and the rows."""
+    """Make TIMESYNC requests to `count` vehicles from `first` on, round robin: frames, their sizes and the rows."""
     frames = np.zeros((count, TIMESYNC_FRAME_BYTES), np.uint8)
     sizes, rows, place = np.empty(count, np.int64), np.empty(count, np.int64), 0
     for turn in range(first, first + count):
@@ -157,10 +157,10 @@ def ask(
 
 @kernel
 def delivery_ns(link: Record, clock: Record, key_ms: int, sent_ns: int) -> int:
-    """How long after `sent_ns` the set-point with this stamp acts: it arrives, and the vehicle may hold it.
+    """Time from `sent_ns` until the set-point with the stamp `key_ms` acts: the delay down, or longer if it is held.
 
-    It acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is unknown.
-    UNKNOWN while the delay to the vehicle is.
+    A held set-point acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is
+    unknown. The result is UNKNOWN while the delay down is.
     """
     if clock.down_ns == UNKNOWN or not key_ms or link.lag_jumps != clock.jumps or not clock.samples:
         return clock.down_ns
@@ -176,7 +176,7 @@ def _delivery_at_ns(known: Records, clocks: Records, row: int, key_ms: int, sent
 
 HEARTBEAT = np.frombuffer(mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0), np.uint8)
 Report = Callable[[str, str, int], None]
-"""Takes an event: its kind, its text and the system id of the vehicle."""
+"""Callback that takes an event: its kind, its text and the system id of the vehicle."""
 
 
 def ignored(kind: str, text: str, system_id: int) -> None:
@@ -194,21 +194,21 @@ class _Waiting:
 
 
 class RemoteVehicle:
-    """What is known of one vehicle; `next_frame` gives the frames that bring it to the state the station wants.
+    """The state of one vehicle; `next_frame` gives the frames that bring it to the state the station wants.
 
-    `startup` holds what depends on the kind of vehicle. At the end the vehicle lands if `land` is set, else it holds.
-    What every frame changes is in a row of `links`.
+    `startup` does what depends on the kind of vehicle. At the end the vehicle lands if `land` is set, else it holds.
+    State that every frame may change is in a row of `links`.
     """
 
     heard_ns = Cell[int]()
-    """When the newest valid frame came."""
+    """When the newest valid frame arrived."""
     first_heard_ns = Cell[int | None](0)
     newest = Cell[bool]()
-    """Whether the last frame taken in was sent after all the others."""
+    """Whether the last frame processed was sent after all the others."""
     left_out = Cell[bool]()
     """Whether the formation flies without it because it did not become ready in time."""
     heartbeat_ns = Cell[int]()
-    """When the newest heartbeat came."""
+    """When the newest heartbeat arrived."""
     _launched, _heartbeat = Cell[bool](), Cell[int]()
     _local_ms, _local_is_new = Cell[int](), Cell[bool]()
     _told, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
@@ -226,8 +226,8 @@ class RemoteVehicle:
     ) -> None:
         self.system_id, self.wire_id = system_id, wire_id(system_id)
         self.external = external
-        """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter. It
-        is asked for messages, and nothing else."""
+        """Whether it is planned that somebody else flies it. It takes part in the formation and its mode does not
+        matter; the station only requests messages from it."""
         self._links, self._row = links or new_links(1), row
         self._columns = Columns(self._links.known)
         self.frames = SequenceCounter(self._links.counters, row)
@@ -236,29 +236,29 @@ class RemoteVehicle:
         self.custom_mode = -1
         self.critical = False
         self.goal: Goal | None = Goal.FLY
-        """None: the vehicle is left to itself."""
+        """None: the vehicle is left alone."""
         self.taken_over = False
-        """Whether the vehicle's pilot flies it, or its autopilot for a reason of its own. This ends only when it
-        reports that it is guided; until then the station asks it for telemetry and commands nothing."""
+        """Whether a pilot, or the autopilot on its own account, flies the vehicle. This ends only when the vehicle
+        reports the guided mode; until then the station requests telemetry and commands nothing else."""
         self.startup = startup
         self.kind = startup.kind
         self._launched = not self.kind.piloted
         self._has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
-        """When the first heartbeat after a long silence arrived. It may be a replay: its number does not show that."""
+        """When the first heartbeat after a long silence arrived. Its sequence number does not reveal a replay."""
         self._land = land
         self._now_ns = 0
         self._report = report
         self._command: _Waiting | None = None
         self._settled = False
-        """Whether the vehicle takes set-points and lacks nothing, so that no command is due until it says otherwise.
-        One with an autopilot never counts as settled, because its start-up counts time."""
+        """Whether the vehicle takes set-points and lacks nothing: no command is due until it reports otherwise. One
+        with an autopilot never counts as settled, because its start-up depends on time."""
         self._earlier = 0, 0
-        """A command that was sent more than once, and how many answers to its copies may still come."""
+        """A command that was sent more than once, and how many answers to its copies may still arrive."""
         self._not_before_ns = 0
         self._outdated: list[tuple[int, int, bool]] = []
-        """Time of the ACK of each recent command that changed mode or arming, with the mode and arming before it. A
-        heartbeat made before the command was carried out may still report these."""
+        """For each recent command that changed mode or arming: the time of its ACK, and mode and arming before it. A
+        heartbeat sent before the command was executed still reports those."""
 
     @property
     def address(self) -> Address | None:
@@ -276,7 +276,7 @@ class RemoteVehicle:
 
     @property
     def ended(self) -> bool:
-        """Whether the vehicle holds or lands, or is not ours to end: it never took off, or somebody else flies it."""
+        """Whether the vehicle holds or lands, or must not be told to: it is not armed, or somebody else flies it."""
         if self.external:
             return True
         if self.kind.piloted and (self.kind is UNRECOGNISED or not self.armed):
@@ -285,19 +285,19 @@ class RemoteVehicle:
 
     @property
     def guided(self) -> bool:
-        """Whether it takes part in the flight: armed and in its guided mode, or flown by somebody else as planned."""
+        """Whether it takes part in the flight: armed in its guided mode, or flown by somebody else as planned."""
         return self.external or (self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over)
 
     @property
     def idle(self) -> bool:
-        """Whether `next_frame` has nothing to send until the vehicle says something."""
+        """Whether `next_frame` has nothing to send until the vehicle sends a message."""
         return self._settled and self.goal is Goal.FLY
 
     @property
     def quiet_until_ns(self) -> float:
-        """Until when `next_frame` sends nothing and the vehicle cannot become `silent`.
+        """The time until which `next_frame` sends nothing and the vehicle cannot become `silent`.
 
-        This holds if its parameters are uploaded and it says nothing unusual. 0 if unknown, infinity until it is heard.
+        Valid if its parameters are uploaded and it sends nothing unusual. 0: unknown; infinity: not heard yet.
         """
         waiting = self._command
         if self.address is None:
@@ -308,7 +308,7 @@ class RemoteVehicle:
 
     @property
     def has_to_speak(self) -> bool:
-        """Whether it cannot become ready before it says something unusual."""
+        """Whether it cannot become ready before it sends something unusual."""
         return not self.left_out and (self.address is None or self._next_step().command is not None)
 
     @property
@@ -322,7 +322,7 @@ class RemoteVehicle:
 
     @property
     def missing(self) -> str:
-        """What keeps the vehicle from being ready, in words; empty if it is ready."""
+        """Why the vehicle is not ready, in words; empty if it is ready."""
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
         if self.taken_over and not self.startup.has_landed:
@@ -331,28 +331,28 @@ class RemoteVehicle:
         return self._next_step().missing
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:
-        """A frame to this vehicle, numbered in a sequence of its own so that the vehicle can count losses."""
+        """A frame to this vehicle, with sequence numbers of its own, by which the vehicle can count losses."""
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
 
     def send(self, msg_id: int, fields: tuple[Any, ...], outgoing: Outbox) -> None:
-        """Add a frame to the datagrams to be sent, if the vehicle's address is known."""
+        """Queue a frame to the vehicle, if its address is known."""
         if self.address is not None:
             outgoing.append((self.encode(msg_id, fields), self.address))
 
     def is_elsewhere(self, address: Address, received_ns: int) -> bool:
-        """Whether the vehicle is known to send from another address and has been heard lately."""
+        """Whether the vehicle sends from another address and has been heard recently."""
         return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * NS_PER_S
 
     def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
-        """Whether a frame from another address can be from this vehicle: a heartbeat, at first and after silence."""
+        """Whether a frame from a new address may be from this vehicle: only a heartbeat, at first or after silence."""
         return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
 
     def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:
         """Whether a frame was received before, or is a heartbeat that a newer frame has overtaken.
 
-        Links that reorder or repeat frames do this all the time: it is counted in `frames` and reported once.
-        A restarted vehicle numbers its frames anew, so after some time without a good heartbeat any is taken.
+        Links that reorder or repeat frames cause this all the time: it is counted in `frames` and reported once.
+        A restarted vehicle restarts its numbers: FORGET_NUMBERS_NS after the last valid heartbeat, any one is accepted.
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
         order = self.frames.add(frame.sequence, now_ns)
@@ -371,7 +371,7 @@ class RemoteVehicle:
         return replayed
 
     def tell_startup(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        """Let the start-up take in a message; kernels tell it nothing of positions."""
+        """Pass a message to the start-up, after the position that kernels have stored and not passed on."""
         self._tell_position()
         self.startup.take(msg_id, fields)
 
@@ -382,22 +382,22 @@ class RemoteVehicle:
             self.startup.take(mavlink.LOCAL_POSITION_NED, (self._local_ms, *local))
 
     def report_order(self, order: int) -> None:
-        """Report that its frames arrive LATE or are DUPLICATE."""
+        """Report that its frames arrive LATE or DUPLICATE."""
         self._report("link", _ORDER_TEXT[order], self.system_id)
 
     def named_int(self, fields: tuple[Any, ...]) -> None:
-        """Take in a NAMED_VALUE_INT: the lag after which the vehicle's held set-points act."""
+        """Process a NAMED_VALUE_INT: it may report the lag after which the vehicle's held set-points act."""
         _, value, name = fields
         if name.rstrip(b"\0") == b"LAG_MS":
             self._lag_ms, self._lag_jumps = value, self.clock.jumps
 
     def delivery_ns(self, key_ms: int, sent_ns: int) -> int | None:
-        """How long after `sent_ns` the set-point with this stamp acts; None while that is unknown."""
+        """Time from `sent_ns` until the set-point with this stamp acts; None while unknown."""
         found_ns = _delivery_at_ns(self._links.known, self._links.clocks.known, self._row, key_ms, sent_ns)
         return None if found_ns == UNKNOWN else found_ns
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
-        """Take in a HEARTBEAT. One made before the vehicle carried out a command does not undo what its ACK said."""
+        """Process a HEARTBEAT. One sent before the vehicle executed a command does not undo what the ACK reported."""
         self._settled = False
         custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
         armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
@@ -419,9 +419,9 @@ class RemoteVehicle:
         self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
-        """Notice from a reported mode that somebody else has taken the vehicle over, or given it back.
+        """Detect from a reported mode that somebody else has taken the vehicle over, or handed it back.
 
-        A mode that no command of the station leads to is somebody's choice, unless the vehicle reports a failsafe. On
+        A mode to which no command of the station leads is somebody's choice, unless the vehicle reports a failsafe. On
         the ground, before arming, anybody may set any mode.
         """
         kind, before = self.kind, self.custom_mode
@@ -439,10 +439,10 @@ class RemoteVehicle:
         elif (armed or self.armed) and not critical:
             self.taken_over = not self._takes_off_by(mode)
         if self.taken_over:
-            self._command = None  # repeating it would take the vehicle back
+            self._command = None  # resending it would take the vehicle back
 
     def _takes_off_by(self, mode: int) -> bool:
-        """Whether a mode is part of the take-off that was commanded: its own mode at first, hold at the top."""
+        """Whether a mode belongs to the commanded take-off: first the take-off mode, then hold at the top."""
         kind = self.kind
         if kind.guided_first or self._has_been_guided:
             return False
@@ -469,7 +469,7 @@ class RemoteVehicle:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
             if command == SET_MESSAGE_INTERVAL and waiting.parameters[0] == OPTIONAL:
                 self._report("vehicle", WITHOUT_TARGET, self.system_id)
-            elif command != ARM_DISARM or not self.startup.arming_refusals:  # repeated ones are counted
+            elif command != ARM_DISARM or not self.startup.arming_refusals:  # repeated refusals are only counted
                 self._report("vehicle", f"answered {name} to command {command}", self.system_id)
             self.startup.refused(command, waiting.parameters, now_ns, repeated=waiting.confirmation > 0)
             self._not_before_ns = now_ns + NS_PER_S
@@ -489,9 +489,9 @@ class RemoteVehicle:
     def next_frame(self, now_ns: int) -> bytes | None:
         """The frame that is due to bring the vehicle to the wanted state, if any: a command, else a parameter.
 
-        One command at a time awaits its ACK, which carries no request id. Without an answer for three round trips, and
-        1 s at least, the command is sent again with its confirmation raised. Then there may be several answers:
-        one that comes sooner than a round trip after the next request with the same command does not count for that.
+        One command at a time awaits its ACK, which carries no request id. After three round trips, and at least 1 s,
+        without an answer the command is resent with its confirmation counter raised. Several answers may then arrive:
+        one that arrives within a round trip of the next request with the same command does not answer that request.
         """
         self._now_ns = now_ns
         if self.address is None or self.idle:
@@ -523,7 +523,7 @@ class RemoteVehicle:
                 return None
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
-            self._earlier = 0, 0  # an answer to an earlier request would have come
+            self._earlier = 0, 0  # an answer to an earlier request would have arrived
             revocable = waiting.command == SET_MODE or self.startup.has_landed
             if revocable and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None
@@ -552,7 +552,7 @@ class RemoteVehicle:
         return command if command is None or not self.taken_over or command[0] == SET_MESSAGE_INTERVAL else None
 
     def _next_step(self) -> Step:
-        """The next step of the start-up. Of a vehicle flown by somebody else, mode and arming are its pilot's."""
+        """The next step of the start-up. Mode and arming of a vehicle flown by somebody else are left to its pilot."""
         self._tell_position()
         step = self.startup.next(
             custom_mode=self.kind.guided_mode if self.external else self.custom_mode,
@@ -566,14 +566,14 @@ class RemoteVehicle:
     def begin_anew(self) -> None:
         """Set rates and parameters again: the vehicle seems to have restarted.
 
-        A vehicle that was taken over stays so: perhaps only its clock has slipped.
+        A vehicle that was taken over stays taken over: perhaps only its clock has slipped.
         """
         self.startup.begin_anew()
         self._command, self._settled = None, False
 
 
 def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:
-    """A line that says what vehicles lack, beginning with `what`; empty if there are none. Of many, ten are named."""
+    """A line that begins with `what` and lists what vehicles lack; empty if there are none. At most ten are named."""
     named = [f"vehicle {v.system_id} {v.missing}" for v in vehicles[:_MOST_NAMED]]
     named += [f"{len(vehicles) - _MOST_NAMED} others"] if len(vehicles) > _MOST_NAMED else []
     return what + "; ".join(named) if vehicles else ""

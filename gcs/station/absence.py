@@ -1,4 +1,4 @@
-"""Which vehicles are absent: those that are lost, that have landed, or that a pilot or autopilot flies."""
+"""Absent vehicles: lost, left out, landed, or flown by a pilot or by the autopilot on its own account."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ COMPLETED = "completed: duration reached"
 
 
 def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
-    """Why a vehicle is absent; "" if it takes part. `gone`: it sends no telemetry."""
+    """Why a vehicle is absent; "" if it takes part. `gone`: its telemetry has timed out."""
     if vehicle.left_out:
         return LEFT_OUT
     if gone:
@@ -22,16 +22,16 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
 
 
 PILOTED = (TAKEN_OVER, STAYS_DISARMED)
-"""Why a vehicle is absent that its pilot flies or has landed."""
+"""Reasons for absence of a vehicle that its pilot flies or has landed."""
 
 
 def describe_change(was: str, now: str) -> str:
-    """The text of the event when a vehicle's absence changes."""
+    """The event text for a change in a vehicle's absence."""
     return now or ("is heard again" if was == LOST else "is given back")
 
 
 def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
-    """Why a flight ends: its duration has passed, or no vehicle is left. Absent vehicles are named."""
+    """Why a flight ends: its duration has passed, or no vehicle is left. It names absent vehicles."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
     kinds = (("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", STAYS_DISARMED))

@@ -1,11 +1,11 @@
 """Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
-A flight whose vehicles are that far from their places at the start does not begin (`not_formed`).
+A flight does not begin while a vehicle exceeds that limit (`not_formed`).
 
 A vehicle that returns from its pilot, its failsafe or silence may be far from its place. So may the vehicles behind it,
-whose places are relative to it. Their errors say nothing about the loop until they have had time to return. A vehicle
-is granted this time again only if it has been within the limit since, or if its pilot flew it: a formation that
-diverges while its vehicles keep entering their failsafe is broken.
+whose places are relative to it. Their errors say nothing about the loop until they have had time to return. This time
+is granted again only if the vehicle has been within the limit since, or if its pilot flew it: a formation that diverges
+while its vehicles keep entering their failsafe is broken.
 """
 
 from collections.abc import Mapping
@@ -21,13 +21,13 @@ from gcs.plan.flight_plan import FlightPlan
 from scenarios.kernel import Record, Records
 
 SURELY_WITHIN = 0.7
-"""A vector whose components are within this share of a limit is not longer than the limit."""
+"""A vector whose two components are within this fraction of a limit is not longer than the limit."""
 _TIME_CONSTANTS = 3.0
-"""After this many time constants an error has decayed to a twentieth."""
+"""After this many time constants, an error has decayed to a twentieth."""
 
 
 def not_formed(plan: FlightPlan, history: Reports) -> str:
-    """Which vehicle is too far from its place behind the one in front to begin; empty if none is."""
+    """Why the flight cannot begin: a vehicle is too far from its place behind the one in front. Empty if none is."""
     limit_m, ids = plan.scenario.safety.spacing_error_limit_m, plan.formation.system_ids
     for row in plan.model.followers:
         newest = history.newest(row)
@@ -43,12 +43,12 @@ def not_formed(plan: FlightPlan, history: Reports) -> str:
 
 
 def too_far(system_id: int, error_m: float, limit_m: float) -> str:
-    """Why a flight ends in which a vehicle has a larger spacing error than the limit."""
+    """The end reason of a flight in which a vehicle's spacing error exceeds the limit."""
     return f"broken: spacing error of vehicle {system_id} is {beyond(error_m, limit_m)} m, limit {limit_m:g} m"
 
 
 class Breakage:
-    """Judges each tick of a flight, and remembers which vehicles are returning."""
+    """Decides at each tick whether the formation is broken, and tracks returning vehicles."""
 
     def __init__(self, plan: FlightPlan) -> None:
         n = len(plan.formation.system_ids)
@@ -60,17 +60,17 @@ class Breakage:
         self._has_returned = [True] * n
         """Whether the vehicle has been within the limit since it was last granted time to return."""
         self.all_back = True
-        """Whether this is so of every vehicle, and none is away."""
+        """Whether every vehicle has returned and none is away."""
         self._piloted = [False] * n
         self._behind: list[list[int]] = [[row] for row in range(n)]
-        """Each vehicle with all that follow it, directly or through others."""
+        """The rows of each vehicle and of all its followers, direct and indirect."""
         for row in range(n - 1, 0, -1):
             self._behind[plan.model.predecessors[row]] += self._behind[row]
 
     def judge(self, controls: Records, away: Mapping[int, bool], nearest: Nearest, time_s: float) -> str:
         """Why the flight must end at this tick; empty if it may continue.
 
-        `away` holds the vehicles, by row, that do not follow their commands, and whether pilots fly them.
+        The keys of `away` are the rows of vehicles that do not follow commands, its values whether pilots fly them.
         """
         ids, limit_m = self._plan.formation.system_ids, self._safety.spacing_error_limit_m
         closest_m = np.fmin.reduce(nearest.distance_m)
@@ -116,7 +116,7 @@ class Breakage:
 
 
 def slowest_decay_1_s(plan: FlightPlan) -> float:
-    """Decay rate in 1/s, without delay, of the slowest gains of the schedule: those with which a vehicle returns."""
+    """Decay rate in 1/s, without delay, of the slowest gains in the schedule, with which a vehicle returns."""
     model = plan.model
     closed_loop = model.A + model.B @ plan.gains[-1]
     loops = [closed_loop]
@@ -127,11 +127,11 @@ def slowest_decay_1_s(plan: FlightPlan) -> float:
 
 
 def recovery_time_s(plan: FlightPlan, decay_1_s: float, way_m: float, speed_m_s: float) -> float:
-    """Time that a vehicle is given to return over a distance before its spacing error is judged again.
+    """Time granted to a vehicle to return over a distance before its spacing error is judged again.
 
-    Three time constants of the slowest gains, plus the time in which the error decays to the spacing error limit.
-    Limits of acceleration and speed add twice the time that the distance takes under them alone: to speed up and slow
-    down, and to cover it at the speed in excess of the formation's own. 0 for gains that do not decay.
+    Three time constants of the slowest gains, plus the time for the error to decay to the spacing error limit. A limit
+    of acceleration adds twice the time to speed up and slow down over the distance; a limit of speed adds twice the
+    time to cover it at the speed in excess of the formation's own. 0 for gains that do not decay.
     """
     if decay_1_s <= 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""The kind of vehicles, chosen once, when the station is built.
+"""Selects the kind of vehicles, once, when the station is built.
 
 Nothing else in the station reads the scenario's `dynamics`.
 """
@@ -11,7 +11,7 @@ from gcs.plan.flight_plan import FlightPlan
 
 
 def fleet_of(plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> Fleet:
-    """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id).
+    """The fleet for which a plan is made; `report` takes events of its vehicles as (kind, text, system id).
 
     `law` is the user's own control law, if it is to be flown.
     """

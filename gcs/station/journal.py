@@ -1,21 +1,21 @@
-"""The events of a flight and why it is to end, to which the parts of a station write."""
+"""The journal of a flight: its events, and the reason why it is to end. All parts of a station write to it."""
 
 from gcs.control.tick import Event
 from scenarios.schema import NS_PER_S
 
 
 class Journal:
-    """Takes events as they happen. Times are of the station's clock; `now_ns` is that of the step under way.
+    """Records events as they happen. Times are on the station's clock; `now_ns` is the time of the current step.
 
-    It knows none of those who write to it. So a station that nobody needs any more is freed at once, not by the next
-    search for reference cycles.
+    It holds no reference to the parts that write to it, so a station that is no longer used is freed at once and not by
+    the next garbage collection of reference cycles.
     """
 
     def __init__(self, start_ns: int, patience_s: float) -> None:
         self.now_ns = start_ns
         self.events: list[Event] = []
         self.stop = ""
-        """Why the flight is to end; the first reason counts."""
+        """Why the flight is to end; the first reason is kept."""
         self.flight_start_ns: int | None = None
         """When the formation flight began."""
         self._start_ns, self._patience_s = start_ns, patience_s
@@ -27,7 +27,7 @@ class Journal:
         return (now_ns - self.flight_start_ns) / NS_PER_S
 
     def request_stop(self, reason: str) -> None:
-        """End the flight at the next tick; without a reason, go on."""
+        """End the flight at the next tick; an empty reason is ignored."""
         self.stop = self.stop or reason
 
     def report(self, kind: str, text: str, system_id: int | None = None, counts: dict[str, int] | None = None) -> None:

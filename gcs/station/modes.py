@@ -1,7 +1,7 @@
-"""The mode and the gain set of one vehicle, as its headroom changes: `next_state` is the whole decision.
+"""The mode and the gain set of one vehicle as its headroom changes; `next_state` is the whole decision.
 
-As headroom shrinks, the vehicle's gains change to slower sets; last, it is released to its failsafe. When the link
-recovers, these actions are undone in the reverse order. One table says what each takes.
+As headroom shrinks, the vehicle's gains change to slower sets; finally it is released to its failsafe. When the link
+recovers, these actions are undone in reverse order. The table in `next_state` lists all conditions.
 """
 
 from math import inf
@@ -28,25 +28,25 @@ STATE = np.dtype(
 
 
 class VehicleState(NamedTuple):
-    """What the monitor remembers of one vehicle. Times are scenario times in s."""
+    """The monitor's state of one vehicle. Times are scenario times in s."""
 
     mode: Mode = Mode.WAITING
     gain_set: int = 0
-    """Place in the schedule, 0 the fastest."""
+    """Index in the schedule; 0 is the fastest."""
     former_set: int = 0
     """The set before the last change; blended out until `changed_s` + `blend_s`."""
     changed_s: float = -1e9
     pressed_s: float = inf
-    """Since when headroom has been low enough for slower gains; infinite if it is not."""
+    """The time since which headroom has been low enough for slower gains; infinite if it is not."""
     eased_s: float = inf
-    """Since when headroom has been high enough for faster gains; infinite if it is not."""
+    """The time since which headroom has been high enough for faster gains; infinite if it is not."""
     released: bool = False
 
 
 class Observation(NamedTuple):
-    """What is known of one vehicle at a tick.
+    """The monitor's inputs for one vehicle at a tick.
 
-    `loop_delay_s` may be NaN (unknown). With prediction it is the part of the delay that counts against the margin,
+    `loop_delay_s` may be NaN (unknown). With prediction it is the part of the delay that counts against the margin:
     see `gcs.plan.mismatch.Tolerated.used_s`.
     """
 
@@ -60,7 +60,7 @@ class Observation(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """What `scenarios.schema.Monitor` says of the modes of a vehicle."""
+    """The keys of `scenarios.schema.Monitor` that decide a vehicle's mode."""
 
     act: bool
     caution_headroom: float
@@ -77,10 +77,10 @@ def policy_of(monitor: Monitor) -> Policy:
 
 @kernel
 def next_state(state: Record, seen: Observation, margins_s: Array, policy: Policy) -> None:
-    """Change a vehicle's state, a record of STATE, by one tick. `margins_s` are the margins of its gain sets.
+    """Advance a vehicle's state, a record of STATE, by one tick. `margins_s` are the margins of its gain sets.
 
     h is the headroom of the set flown, h+ that of the next faster set. "For hold" and "for ease" mean that the
-    condition has lasted `policy.hold_s` or `policy.ease_s`. The first row that fits applies:
+    condition has lasted `policy.hold_s` or `policy.ease_s`. The first matching row applies:
 
     ==================  ====================================================  ============================
     from                when                                                  to
@@ -103,8 +103,8 @@ def next_state(state: Record, seen: Observation, margins_s: Array, policy: Polic
     RECOVERING          gains blended in: fastest set / slower set            NOMINAL / CAUTION
     ==================  ====================================================  ============================
 
-    Gains do not change again while they are being blended. With `policy.act` off the modes are the same, but the gains
-    stay the fastest set and no vehicle is released.
+    Gains do not change again while they are being blended. With `policy.act` off, the modes are the same, but the
+    fastest gains are kept and no vehicle is released.
     """
     away = state.mode == _LOST or state.mode == _FAILSAFE  # noqa: PLR1714 - Numba would make a tuple of them
     slowest = len(margins_s) - 1 if policy.act else 0
@@ -128,7 +128,7 @@ def next_state(state: Record, seen: Observation, margins_s: Array, policy: Polic
 
 @kernel
 def _by_headroom(state: Record, own: float, faster: float, slowest: int, policy: Policy, now_s: float) -> None:
-    """The rows of the table that depend on headroom: `own` is h there, and `faster` is h+."""
+    """The rows of the table that depend on headroom; `own` is h, and `faster` is h+."""
     last_resort = state.gain_set == slowest and state.mode == _CRITICAL and not state.released
     state.pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
     state.eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)

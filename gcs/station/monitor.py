@@ -1,7 +1,7 @@
 """The monitor turns measured loop delays into modes, and acts before the delay margin is reached.
 
-`gcs.station.modes.next_state` is the whole decision for one vehicle. Gains are blended over time
-when they change, so that commands do not jump.
+`gcs.station.modes.next_state` is the whole decision for one vehicle. When gains change, they are blended over time to
+avoid jumps in the commands.
 
 As headroom shrinks, the monitor acts in this order:
 
@@ -9,7 +9,7 @@ As headroom shrinks, the monitor acts in this order:
 2. Still CRITICAL on the slowest set: the whole formation opens to `open_factor` times its spacing.
 3. No headroom on the slowest set: vehicles are released to their failsafe, those farthest down the tree first.
 
-When the link recovers, these actions are undone in the reverse order.
+When the link recovers, these actions are undone in reverse order.
 """
 
 from math import inf, isinf, isnan, nan
@@ -32,26 +32,26 @@ _headroom = kernel(headroom)
 
 
 class Watched(NamedTuple):
-    """What the monitor knows of n vehicles in arrays, for kernels."""
+    """The monitor's data of n vehicles as arrays, for kernels."""
 
     states: Records
     """Of STATE."""
     after: Records
-    """Of STATE: what `judge` makes of them."""
+    """Of STATE: the next states, computed by `judge`."""
     delays_s: FloatArray
-    """The loop delays of the last ticks, in turn, (n, ticks)."""
+    """The loop delays of the last ticks, (n, ticks): a ring buffer for each vehicle."""
     judged: NDArray[np.int64]
     """Ticks of this flight so far, (1,)."""
     margins_s: FloatArray
-    """How much of its loop delay each gain set tolerates, (n, sets)."""
+    """The largest `Seen.loop_delay_s` that each gain set tolerates, (n, sets)."""
     in_order: FloatArray
-    """Room for the delays of a vehicle, (ticks,)."""
+    """Work array for sorting one vehicle's delays, (ticks,)."""
     changed: NDArray[np.int64]
-    """Room for rows, (n,)."""
+    """Buffer for the rows that `judge` changes, (n,)."""
 
 
 class Seen(NamedTuple):
-    """What is known of n vehicles at a tick: see `Observation`."""
+    """The monitor's inputs for n vehicles at a tick: see `Observation`."""
 
     time_s: float
     flying: bool
@@ -63,16 +63,16 @@ class Seen(NamedTuple):
 
 @kernel
 def _rank(seen: int) -> int:
-    """The place of the judged delay among those seen in ascending order, NaN last.
+    """Index of the judged delay, the 90th percentile, among those seen, sorted in ascending order with NaN last.
 
-    So a vehicle with more than a tenth of unknown ticks has an unknown delay.
+    So the delay of a vehicle is unknown if a tenth or more of its ticks are.
     """
     return min(seen - 1, int(0.9 * seen))
 
 
 @kernel
 def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> float:
-    """The delay by which a vehicle is judged."""
+    """The delay by which a vehicle is judged: see `_rank`."""
     known = 0
     for place in range(seen):
         delay_s = delays_s[row, place]
@@ -88,7 +88,7 @@ def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> fl
 
 @kernel
 def _scaled(delay_s: float, margin_s: float, other_s: float) -> float:
-    """The delay that uses the same share of another margin; unchanged if that is infinite."""
+    """The delay that uses the same fraction of the margin `other_s`; unchanged if that is infinite."""
     if margin_s == other_s or isinf(other_s):
         return delay_s
     if isinf(margin_s):
@@ -98,9 +98,9 @@ def _scaled(delay_s: float, margin_s: float, other_s: float) -> float:
 
 @kernel
 def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
-    """Note the delays of a tick, and find the states after it.
+    """Record the delays of a tick and compute the next states.
 
-    Returns for how many vehicles the mode, the gain set or the release changes; their rows are in `changed`.
+    Returns the number of vehicles whose mode, gain set or release changes; their rows are in `changed`.
     """
     states, after, delays_s, width = watched.states, watched.after, watched.delays_s, watched.delays_s.shape[1]
     place, found, largest_s = watched.judged[0] % width, 0, nan if separable else -inf
@@ -138,7 +138,7 @@ def _is_calm(
     state: Record, seen: Seen, row: int, delays_s: Array, seen_ticks: int, separable: bool, largest_s: float,
     margins_s: Array, policy: Policy,
 ) -> bool:  # fmt: skip
-    """Whether a vehicle is heard, guided and at ease, and its headroom is enough or unknown: true of most ticks."""
+    """Whether a vehicle is heard, guided and at ease, with enough or unknown headroom: true at most ticks."""
     if seen.silent[row] or not seen.guided[row] or not is_at_ease(state):
         return False
     margin_s, caution = margins_s[state.gain_set], policy.caution_headroom
@@ -154,14 +154,14 @@ def _is_calm(
 
 @kernel
 def settle(watched: Watched) -> None:
-    """Make the states after a tick those of the next."""
+    """Adopt the next states as the current ones."""
     for row in range(len(watched.states)):
         watched.states[row] = watched.after[row]
 
 
 @kernel
 def _blend(blends: Records, states: Records, time_s: float, blend_s: float) -> bool:
-    """Fill in the gains that each vehicle is flown with; returns whether some are still being blended in."""
+    """Fill in the gains with which each vehicle is flown; returns whether any are still being blended."""
     blending = False
     for row in range(len(states)):
         state, blend, share = states[row], blends[row], 1.0
@@ -176,8 +176,8 @@ def _blend(blends: Records, states: Records, time_s: float, blend_s: float) -> b
 class FormationMonitor:
     """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
 
-    `separable` says that every vehicle's loop has its own margin, as in a leader-follower tree. If not, the loop delay
-    that uses most of its margin counts for all vehicles, and all change gains together.
+    `separable`: every vehicle's loop has its own margin, as in a leader-follower tree. Otherwise the loop delay that
+    uses the largest fraction of its margin counts for all vehicles, and all change gains together.
     """
 
     def __init__(
@@ -186,9 +186,9 @@ class FormationMonitor:
         self._states, self._after = np.zeros(vehicles, STATE), np.zeros(vehicles, STATE)
         self._states[:] = VehicleState()
         self.modes, self.gain_sets, self.released = (self._states[name] for name in ("mode", "gain_set", "released"))
-        """Those of the vehicles' states."""
+        """Views of the fields of the vehicles' states."""
         self.margins_s = np.tile(margins_s, (vehicles, 1))
-        """How much of its loop delay each gain set tolerates, (vehicles, sets)."""
+        """The largest `Seen.loop_delay_s` that each gain set tolerates, (vehicles, sets)."""
         self.opening = 1.0
         """Factor on the formation's spacing."""
         self.policy, self._keys = policy_of(policy), policy
@@ -198,11 +198,11 @@ class FormationMonitor:
         self._judged, self._changed = np.zeros(1, np.int64), np.zeros(vehicles, np.int64)
         self._in_order = np.zeros(self._delays_s.shape[1])
         self.away: list[int] = []
-        """The rows of the vehicles that do not follow their commands."""
+        """The rows of the vehicles that do not follow commands."""
         self._troubled: list[int] = []
-        """The rows of those on whose account the formation may open."""
+        """The rows of the vehicles for which the formation may open."""
         self.newest_blends, self._settled_s = unblended(vehicles), -inf
-        """What `blends` returned last, and when gains stop changing."""
+        """The last result of `blends`, and when gains stop changing."""
 
     @property
     def states(self) -> list[VehicleState]:
@@ -217,7 +217,7 @@ class FormationMonitor:
         for row in changed:
             before, after = self._state(self._states, row), self._state(self._after, row)
             if after.released and not before.released and row != first:
-                after = after._replace(mode=Mode.CRITICAL, released=False)  # a vehicle behind goes first
+                after = after._replace(mode=Mode.CRITICAL, released=False)  # a vehicle behind it is released first
                 self._after[row] = after
             if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                 changes.append((row, before, after))
@@ -233,11 +233,11 @@ class FormationMonitor:
         return VehicleState(Mode(mode), *rest)
 
     def _rows(self, modes: tuple[Mode, ...]) -> list[int]:
-        """The vehicles in one of these modes."""
+        """The rows of the vehicles in any of these modes."""
         return np.isin(self.modes, modes).nonzero()[0].tolist()
 
     def blends(self, time_s: float) -> Records:
-        """The gains (n, BLEND) that each vehicle is flown with."""
+        """The gains (n, BLEND) with which each vehicle is flown."""
         if time_s >= self._settled_s:
             return self.newest_blends
         self.newest_blends = unblended(len(self._states))
@@ -251,7 +251,7 @@ class FormationMonitor:
         )  # fmt: skip
 
     def is_calm(self, time_s: float, *, flying: bool) -> bool:
-        """Whether gains and spacing stay as they are and, in flight, no vehicle is away."""
+        """Whether gains and spacing are constant and, in flight, no vehicle is away."""
         if time_s < self._settled_s or self.opening != 1.0:
             return False
         return not flying or not ((self._keys.act and self._troubled) or self.away)

@@ -1,7 +1,7 @@
-"""Takes datagrams in: what vehicles sent, and what follows from it for their clocks, their states and their start-up.
+"""Processes received datagrams: updates each vehicle's clock, states, link statistics and start-up.
 
-Nearly all datagrams hold one LOCAL_POSITION_NED, a TIMESYNC, or a heartbeat like the last one. One
-kernel takes all of these, up to the first datagram that is anything else; that one is read frame by frame, by the same
+Nearly all datagrams hold one LOCAL_POSITION_NED, a TIMESYNC, or a heartbeat like the last one. One kernel processes
+these, up to the first datagram that is anything else. That one is decoded frame by frame in Python, with the same
 kernels where they apply.
 """
 
@@ -34,32 +34,32 @@ from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
 AUTOPILOT_COMPONENT = 1
-"""A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
+"""Component id of the autopilot. A camera or gimbal has the vehicle's system id and sends its own heartbeats."""
 ANOTHER_ADDRESS = "known system id from another address"
 _NOT_KNOWN = -2
-"""In place of the number of an address that no vehicle sends from."""
+"""Stands for the number of an address from which no vehicle sends."""
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 REPORTED = np.dtype(
     [
         ("boot_ms", "i8"),
         ("down_m", "f8"),
         ("velocity_down_m_s", "f8"),
-        ("queue_s", "f8"),  # wait in the socket's buffer
-        ("received_ns", "i8"),  # the operating system's stamp
-        ("bound_s", "f8"),  # the largest error of the instant at which the state was sampled
+        ("queue_s", "f8"),  # wait in the socket buffer
+        ("received_ns", "i8"),  # the operating system's receive timestamp
+        ("bound_s", "f8"),  # largest error of the instant at which the state was sampled
     ]
 )
-"""What came with a vehicle's newest state."""
+"""Data received with a vehicle's newest state."""
 _ORDER, _DELIVERY, _JUMP, _EXCHANGE, ANSWER = range(5)
 _NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8")])
-"""What Python does once a kernel is done: _ORDER: report an order of frames (value_ns); _DELIVERY: tell the loop the
-one-way delay (value_ns) of what was sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns; ANSWER:
-the request sent_ns that came at value_ns."""
+"""Work that a kernel leaves to Python. _ORDER: report a frame order (value_ns); _DELIVERY: pass to the loop the one-way
+delay (value_ns) of a message sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns; ANSWER: answer
+the request sent_ns that arrived at value_ns."""
 NEWS_OF_A_FRAME = 3
 
 
 class Tables(NamedTuple):
-    """What kernels know of n vehicles, one row for each."""
+    """The tables on which kernels work, one row for each of n vehicles."""
 
     links: Records
     clocks: Records
@@ -70,30 +70,30 @@ class Tables(NamedTuple):
     report_counts: NDArray[np.int64]
     reported: Records
     telemetry_ns: NDArray[np.int64]
-    """When the newest state came."""
+    """When the newest state arrived."""
     frame_ned_m: FloatArray
     fresh_ns: NDArray[np.int64]
-    """Round trips that no tick holds yet, oldest first, and how many in each row."""
+    """Round trips not yet in any tick, oldest first; `fresh_counts` holds their number in each row."""
     fresh_counts: NDArray[np.int64]
     news: Records
     news_count: NDArray[np.int64]
-    """How many of `news` are new, (1,)."""
+    """Number of valid entries in `news`, (1,)."""
 
 
 class Now(NamedTuple):
-    """The time of a step."""
+    """The time of a step, and parameters common to all vehicles."""
 
     now_ns: int
     start_ns: int
-    """When the flight's clock began."""
+    """The zero of the stamps in set-points."""
     period_ns: int
-    """Least time between two exchanges because of refused states."""
+    """Minimum time between two exchanges requested because of refused states."""
     tells: bool
     """Whether the loop heeds deliveries."""
 
 
 def new_reported(n: int) -> Records:
-    """Of REPORTED: nothing has come."""
+    """An array of REPORTED for vehicles that have reported nothing yet."""
     reported = np.zeros(n, REPORTED)
     for name in ("down_m", "velocity_down_m_s", "queue_s", "bound_s"):
         reported[name] = nan
@@ -101,7 +101,7 @@ def new_reported(n: int) -> Records:
 
 
 class Reception:
-    """What the vehicles of a fleet have sent. `report` takes events."""
+    """Receives what the vehicles of a fleet send. `report` takes events."""
 
     def __init__(self, fleet: Fleet, report: Report, *, start_ns: int, period_ns: int) -> None:
         self._fleet, self._report = fleet, report
@@ -110,24 +110,24 @@ class Reception:
         self.history = StateHistory(n)
         self.reported = new_reported(n)
         self.telemetry_ns = np.zeros(n, np.int64)
-        """When the newest state of each vehicle came."""
+        """When the newest state of each vehicle arrived."""
         self.frames = Frames()
         """Frames received since the driver last took them."""
         self.counters: Counter[str] = Counter()
-        """Frames that were refused, by reason."""
+        """Number of refused frames, by reason."""
         self.touched: set[int] = set()
-        """Vehicles that have sent anything that is not usual since `touched` was last cleared."""
+        """Rows of vehicles that have sent something unusual since `touched` was last cleared."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
             self.row_of[network_of(system_id), wire_id(system_id)] = row
         self._senders: tuple[int, Sequence[Address], NDArray[np.int64]] = 0, (), np.empty((2, 0), np.int64)
-        """What `numbered` returned, and how many addresses were known then."""
+        """The last result of `numbered`, with the number of addresses known then and its argument."""
         self._news_of(1)
 
     def _news_of(self, datagrams: int) -> None:
-        """Make room for the news of so many datagrams."""
+        """Allocate room for the news of this many datagrams."""
         links, history = self._fleet.links, self.history
         news = np.zeros(max(64, 2 * NEWS_OF_A_FRAME * datagrams), _NEWS)
         self.tables = Tables(
@@ -136,12 +136,12 @@ class Reception:
         )  # fmt: skip
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
-        """Whether a frame claims this id, as in frames, of a vehicle that is known to send from another address."""
+        """Whether this system id, as on the wire, belongs to a vehicle that is known to send from another address."""
         row = self._row.get(system_id_of(datagram.address[2], system_id))
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
     def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> Outbox:
-        """Take datagrams in but for the first ones, which a kernel has taken; returns the answers to them."""
+        """Process datagrams, except the first `taken`, which a kernel has processed; returns the answers to all."""
         outgoing = Outbox()
         if not len(datagrams):
             return outgoing
@@ -167,7 +167,7 @@ class Reception:
         return outgoing
 
     def numbered(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
-        """The network of each address, and its number among those that vehicles send from, shape (2, m)."""
+        """The network of each address, and its number among the vehicles' addresses, shape (2, m)."""
         numbers = self._fleet.links.addresses
         known, of, senders = self._senders
         if of is not addresses or senders.shape[1] != len(addresses):
@@ -181,7 +181,7 @@ class Reception:
         return senders
 
     def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:
-        """Take in one datagram, whatever it holds."""
+        """Process one datagram with any content."""
         if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
             # PX4 sends heartbeats in MAVLink 1 until it is answered in MAVLink 2
             frames = [one for one in mavlink.decode_1(datagram.data, self.counters) if one.msg_id == HEARTBEAT]
@@ -253,7 +253,7 @@ class Reception:
         vehicle.tell_startup(frame.msg_id, fields)
 
     def _follow_up(self, outgoing: Outbox) -> None:
-        """Do what the kernels have left to do."""
+        """Do the work that kernels have left to Python."""
         count = self.tables.news_count.item()
         if not count:
             return
@@ -284,7 +284,7 @@ def _note(all_news: Records, count: Array, kind: int, row: int, value_ns: int, s
 
 @array_kernel
 def take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
-    """For each vehicle its oldest fresh round trip in s, which is fresh no more; NaN if there is none."""
+    """Remove and return each vehicle's oldest fresh round trip, in s; NaN if there is none."""
     found_s = np.empty(len(counts))
     for row in range(len(counts)):
         found_s[row] = nan
@@ -300,7 +300,7 @@ def take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
 def take_usual(
     tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, senders: Array, now: Now
 ) -> int:
-    """Take in the datagrams from the `first` on; returns the place of one that is not usual, or their number.
+    """Process datagrams from `first` on; returns the index of the first that is not usual, or their number if all are.
 
     Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `Reception.numbered` returns.
     """
@@ -329,7 +329,7 @@ def _take_frame(
     queued_ns: int,
     now: Now,
 ) -> bool:
-    """Take in a frame of a usual message; False, and nothing is done, if more may follow from it than kernels know."""
+    """Process a frame of a usual message; does nothing and returns False if it may need more than kernels can do."""
     link, payload, payload_end = tables.links[row], begin + _HEADER_BYTES, end - _CHECKSUM_BYTES
     state = _state_at(stream, payload, payload_end)
     tc1_ns = int64(unsigned_at(stream, payload, 8, payload_end))
@@ -380,7 +380,7 @@ def _state_at(stream: Array, payload: int, end: int) -> tuple[float, ...]:
 def _take_position(
     tables: Tables, row: int, boot_ms: int, state: tuple[float, ...], received_ns: int, queued_ns: int, now: Now
 ) -> None:
-    """Take in the fields of a LOCAL_POSITION_NED; `state` is position and velocity, north, east and down."""
+    """Process the fields of a LOCAL_POSITION_NED; `state` is position and velocity, north, east and down."""
     link, clock = tables.links[row], tables.clocks[row]
     link.local_ms, link.local_is_new = boot_ms, True
     for k in range(6):
@@ -390,7 +390,7 @@ def _take_position(
         return  # on the ground, others may fly over it
     if sample_ns == UNKNOWN:
         if not (clock.lost or clock.doubtful_state):
-            tables.telemetry_ns[row] = received_ns  # heard before the first exchange
+            tables.telemetry_ns[row] = received_ns  # heard, though before the first exchange
         elif now.now_ns - clock.asked_ns >= now.period_ns:
             _note(tables.news, tables.news_count, _EXCHANGE, row, request(clock, tables.pending_ns[row], now.now_ns), 0)
         return
@@ -407,7 +407,7 @@ def _take_position(
 
 @kernel
 def _take_reply(tables: Tables, row: int, tc1_ns: int, ts1_ns: int, received_ns: int, now: Now) -> None:
-    """Take in a reply to a TIMESYNC request."""
+    """Process a reply to a TIMESYNC request."""
     link, clock = tables.links[row], tables.clocks[row]
     jumps = clock.jumps
     rtt_ns = reply(clock, tables.exchanges[row], tables.pending_ns[row], tc1_ns, ts1_ns, received_ns)

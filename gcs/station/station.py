@@ -1,7 +1,7 @@
-"""The ground station as a pure machine: datagrams and the time in, datagrams and tick records out.
+"""The ground station as a pure state machine: datagrams and the time in, datagrams and tick records out.
 
-One loop: receive, decide, command, record. No socket, clock or file is touched here; a driver feeds `step` in real time
-or in virtual time, with the same bytes.
+One loop: receive, decide, command, record. It uses no socket, clock or file; a driver calls `step` in real time or in
+virtual time, with the same bytes.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -45,13 +45,13 @@ from scenarios.kernel import Cell, Columns, Records
 from scenarios.schema import NS_PER_S
 
 _REQUESTS_APART_NS = 7_000_000
-"""Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
+"""Minimum time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
 _IN_A_TICK = 250
-"""Vehicles whose start-up is looked after at one tick; of more, these take turns."""
+"""Maximum number of vehicles whose start-up is advanced in one tick; if there are more, they take turns."""
 Tolerances = tuple[FloatArray, FloatArray]
 """How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
 _NEAR = 0.1
-"""A vehicle that returns is near its place within this share of the spacing error limit."""
+"""A returning vehicle is near its place if its spacing error is within this fraction of the limit."""
 
 
 class Station:
@@ -96,8 +96,8 @@ class Station:
         self._start_ns = self._phase_since_ns = start_ns
         self._schedule = np.zeros(1, SCHEDULE)
         self._columns, self._row = Columns(self._schedule), 0
-        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
-        # vehicles are sent together.
+        # Requests are spread evenly between ticks, to avoid waiting behind set-points. With many vehicles, several are
+        # sent together.
         for name, value in {
             "now_ns": start_ns, "start_ns": start_ns, "next_tick_ns": start_ns, "next_heartbeat_ns": start_ns,
             "next_timesync_ns": start_ns + self._period_ns // 2, "next_requests_ns": start_ns + self._period_ns // 2,
@@ -111,21 +111,21 @@ class Station:
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
         self._tolerated = None if measured else self._tolerances(np.zeros(n))
-        """The tolerances of every tick, if they do not depend on a measured delay."""
+        """The tolerances at every tick, unless they depend on a measured delay."""
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
         self._rows, self._ready, self._busy = range(n), 0, set(range(n))
-        """Vehicles for which a command may be due."""
+        """`_busy`: rows of vehicles for which a command may be due."""
         self._absent, self._gone = [""] * n, dict[int, bool]()
-        """Why each vehicle is absent, "" if it is not; those that are, by row, and whether pilots fly them."""
+        """Why each vehicle is absent, "" if it is not; and those absent, by row, with whether pilots fly them."""
         self._returning: dict[int, bool] = {}
-        """Vehicles that take part again, by row, and whether they were far from their places when last looked at. The
-        others do without them until they are near."""
+        """Rows of vehicles that take part again, with whether they were far from their places at the last check. The
+        others fly without them until they are near."""
 
     @property
     def next_event_ns(self) -> int:
-        """When `step` next has something to do even if nothing is received."""
+        """When `step` next has something to do if nothing is received."""
         return min(self.next_tick_ns, self._next_heartbeat_ns, self._next_requests_ns)
 
     def request_stop(self, reason: str) -> None:
@@ -138,7 +138,7 @@ class Station:
         return Outbox([(frame, address) for frame, address in commands if frame is not None and address is not None])
 
     def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> tuple[Outbox, Tick | None]:
-        """Take datagrams in, but for those that a usual step has taken in, and do what is due.
+        """Process datagrams, except the first `taken`, which a usual step has processed, and do what is due.
 
         Returns
         -------
@@ -148,7 +148,7 @@ class Station:
         self._columns["now_ns"][0] = self._journal.now_ns = now_ns
         outgoing = self._reception.take(datagrams, now_ns, taken)
         if now_ns >= self.next_tick_ns:
-            # set-points do not wait for what may come in a step of its own
+            # set-points do not wait for heartbeats and requests, which can have their own step
             return outgoing, self._usual_tick(outgoing) or self._tick(outgoing)
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + HEARTBEAT_NS
@@ -161,7 +161,7 @@ class Station:
 
     @property
     def usual(self) -> Usual:
-        """What usual steps work on; the steps in Python replace parts of it."""
+        """The arguments of usual steps; valid until the next step in Python, which may replace parts of them."""
         monitor, tolerated = self._monitor, self._tolerated
         assert tolerated is not None
         return Usual(
@@ -173,13 +173,13 @@ class Station:
 
     @property
     def is_usual(self) -> bool:
-        """Whether steps may be usual."""
+        """Whether steps may take the fast path of `gcs.station.usual`."""
         return self._fleet.is_usual and self._tolerated is not None
 
     def look_ahead(self, ticks: Columns, most: int) -> int:
-        """Fill in what usual steps need to know of the next ticks, up to `most`; `ticks` are the columns of DUE.
+        """Fill in, for up to `most` ticks ahead, the data that usual steps need; `ticks` are the columns of DUE.
 
-        Returns how many may be usual, which they are only as long as no step in Python comes between.
+        Returns the number of ticks that may be usual. A step in Python in between invalidates the rest.
         """
         scenario, next_ns, flying = self.plan.scenario, self.next_tick_ns, self.phase is Phase.FLYING
         waiting = self._reception.touched or self._gone or self._returning
@@ -198,9 +198,9 @@ class Station:
         return most
 
     def _quiet_until_ns(self) -> float:
-        """Before and after the flight: until when ticks do nothing, unless a vehicle says something unusual.
+        """The time before which ticks outside the flight have nothing to do unless a vehicle sends something unusual.
 
-        0 if that is not known; see also `_longest_phase_s`.
+        0 if unknown; see also `_longest_phase_s`.
         """
         if len(self.vehicles) > _IN_A_TICK:
             return 0
@@ -212,13 +212,13 @@ class Station:
         return min(vehicle.quiet_until_ns for vehicle in self.vehicles) if waits else 0
 
     def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
-        """A tick in flight whose set-points kernels have made; the arguments are as in `Tick`."""
+        """A tick whose set-points kernels have made; the arguments are fields of `Tick`."""
         self._journal.now_ns = self._columns["now_ns"][0]
         number = (due_ns - self._start_ns) // self._period_ns
         return Tick(number, time_s, due_ns, self._key_ms(due_ns), None, indices)
 
     def _judged_by_kernels(self, due_ns: int) -> Judged:
-        """What the kernels found that made the set-points of a tick."""
+        """The results behind set-points that kernels have made."""
         controls, rtt_s = self._scratch.controls, self._scratch.rtt_s
         followed = commanded(controls, self._monitor.released, True)
         return self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
@@ -229,18 +229,18 @@ class Station:
 
     @property
     def _longest_phase_s(self) -> float:
-        """How long CONNECTING, FLYING or ENDING lasts at most."""
+        """The maximum duration of CONNECTING, FLYING or ENDING."""
         if self.phase is Phase.FLYING:
             return self.plan.scenario.duration_s
         return END_PATIENCE_S if self.phase is Phase.ENDING else self._start_patience_s
 
     @property
     def _all_ended(self) -> bool:
-        """Whether all vehicles that were ever heard hold or land, or are not the station's to end."""
+        """Whether every vehicle that was ever heard has `ended`."""
         return all(vehicle.ended for vehicle in self.vehicles if vehicle.address is not None)
 
     def _waited_s(self, due_ns: int) -> float:
-        """How long the phase will have lasted at a tick."""
+        """Duration of the current phase at a tick."""
         return (due_ns - self._phase_since_ns) / NS_PER_S
 
     def _judged(
@@ -253,14 +253,14 @@ class Station:
         )  # fmt: skip
 
     def sent(self, outbox: Outbox, sent_ns: NDArray[np.int64]) -> None:
-        """Note when each datagram of a step was sent, if that was later than the step."""
+        """Record when each datagram of a step was sent, if later than the time of the step."""
         note_requests(self._fleet.links, outbox, sent_ns)
 
     def complete(self, tick: Tick, sent_ns: Sequence[int] | NDArray[np.int64]) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom.
 
-        `sent_ns` says when each datagram of the step was sent. What set-points need not wait for is judged here:
-        whether the formation is broken, and who is back near its place.
+        `sent_ns` holds the send time of each datagram of the step. Checks that must not delay set-points are made here:
+        whether the formation is broken, and which vehicles are back near their places.
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
         down_m = judged.reported["down_m"] if self._limits.has_slots else np.empty(0)
@@ -271,14 +271,14 @@ class Station:
             away |= self._gone
             self.request_stop(self._breakage.judge(judged.controls, away, near, tick.time_s))
         at_ns = np.asarray(sent_ns, np.int64) if len(sent_ns) else np.array([self._journal.now_ns])
-        own_ns = at_ns[tick.set_point_indices]  # -1 finds the last one, for vehicles that were sent none
+        own_ns = at_ns[tick.set_point_indices]  # -1, for vehicles that were sent none, selects the last one
         rows, self._used_s[:] = tick_rows(tick, judged, self._fleet.links, near.distance_m, own_ns)
         return rows
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
     def _usual_tick(self, outgoing: Outbox) -> Tick | None:
-        """The tick due now if a kernel can do it, else None."""
+        """Do the tick due now with a kernel if possible, else return None."""
         due_ns, due = self.next_tick_ns, Columns(self._due)
         if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(due, 1):
             return None
@@ -307,7 +307,7 @@ class Station:
         followed = commanded(controls, self._monitor.released, flying)
         orders = Orders(controls, followed, nominal_m_s, due_ns)
         points = self._fleet.set_points(orders, self.phase)
-        shorten(points["velocity_ned_m_s"], self._speed_max_m_s)  # last, so that it holds whoever computed them
+        shorten(points["velocity_ned_m_s"], self._speed_max_m_s)  # last, to apply to all set-points alike
         shorten(points["acceleration_ne_m_s2"], self._limits.acceleration_m_s2)
         self._fleet.loop.sent(due_ns, points)
         indices = self._add_set_points(set_points_to(self._fleet.links, points, self._targets, key_ms), outgoing)
@@ -326,7 +326,7 @@ class Station:
         return tick
 
     def _add_set_points(self, set_points: Block, outgoing: Outbox) -> IntArray:
-        """Add set-points to the datagrams to be sent; returns their indices there, -1 for none."""
+        """Queue set-points; returns each vehicle's index in the queue, -1 for none."""
         indices = np.full(len(self.vehicles), -1)
         indices[set_points.rows] = np.arange(len(outgoing), len(outgoing) + len(set_points.rows))
         outgoing.add(set_points)
@@ -338,14 +338,14 @@ class Station:
         return np.array([own.shorter_s for own in each]), np.array([own.longer_s for own in each])
 
     def _take_back(self, controls: Records) -> None:
-        """Let the others fly again with vehicles that have come near their places."""
+        """Restore the coupling of the others to returning vehicles that are near their places again."""
         near_m = _NEAR * self.plan.scenario.safety.spacing_error_limit_m
         for row, was_far in [*self._returning.items()]:
             control = controls[row]
             if not control["sample_ns"] or hypot(*control["spacing_error_m"].tolist()) > near_m:
                 self._returning[row] = True
                 continue
-            del self._returning[row]  # near, or with nobody ahead to be far from
+            del self._returning[row]  # near, or with nobody ahead, which leaves it without a spacing error
             self._set_law()
             if was_far:
                 self._report("vehicle", "is back near its place", self.vehicles[row].system_id)
@@ -356,7 +356,7 @@ class Station:
         )
 
     def _decide(self, due_ns: int, outgoing: Outbox) -> None:
-        """Update modes, absent vehicles and the flight's phase."""
+        """Update modes, absent vehicles and the phase of the flight."""
         flying = self.phase is Phase.FLYING
         silent = self._journal.now_ns - self._reception.telemetry_ns > self._limits.silence_ns
         self._look_at(self._reception.touched if flying else self._reception.touched | {*self._in_turn(self._rows)})
@@ -396,12 +396,12 @@ class Station:
         self._next_phase(due_ns)
 
     def _in_turn(self, rows: Sequence[int]) -> Sequence[int]:
-        """The rows to look after at this tick: all, or of many the next in turn, as start-up takes 20 µs a vehicle."""
+        """The rows to process at this tick: all, or of many the next in turn, as start-up takes 20 µs a vehicle."""
         first = self._tick_count * _IN_A_TICK % max(1, len(rows))
         return rows if len(rows) <= _IN_A_TICK else [*rows, *rows][first : first + _IN_A_TICK]
 
     def _all_ready(self) -> bool:
-        """Whether all vehicles are ready or left out; looks first at the one that was not at the last call."""
+        """Whether all vehicles are ready or left out. The one that was not at the last call is checked first."""
 
         def ready(row: int) -> bool:
             vehicle = self.vehicles[row]
@@ -411,7 +411,7 @@ class Station:
         return ready(self._ready) and all(map(ready, self._rows))
 
     def _look_at(self, rows: Iterable[int]) -> None:
-        """Take in what may have changed of vehicles."""
+        """Update the state derived from these vehicles, which may have changed."""
         for row in rows:
             vehicle = self.vehicles[row]
             self._guided[row], self._critical[row] = vehicle.guided, vehicle.critical
@@ -452,7 +452,7 @@ class Station:
         if phase is Phase.ENDING:
             self.end_reason = self._journal.stop
             self._fleet.end()
-            # A broken formation is left to its failsafe, if that holds the vehicles: what broke may be the link.
+            # A broken formation is left to its failsafe, if that holds the vehicles: the cause may be the link.
             alone = self._journal.stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
                 vehicle.goal = None if alone else Goal.END

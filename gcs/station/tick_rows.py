@@ -1,4 +1,4 @@
-"""Fills the rows of the tick record from what the station knows at a tick."""
+"""Fills the rows of the tick record."""
 
 from math import nan
 from typing import NamedTuple
@@ -18,7 +18,7 @@ _headroom, _loop_delay_s, _used_s = kernel(headroom), kernel(loop_delay_s), kern
 
 
 class Judged(NamedTuple):
-    """What the monitor and the control law say of n vehicles at a tick, as arrays of n."""
+    """Results of the monitor and the control law for n vehicles at a tick, as arrays of n."""
 
     system_id: NDArray[np.int64]
     mode: NDArray[np.int64]
@@ -28,10 +28,10 @@ class Judged(NamedTuple):
     reported: Records
     """Of `gcs.station.reception.REPORTED`."""
     rtt_s: FloatArray
-    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
+    """The oldest completed round trip that is in no earlier tick; NaN if there is none."""
     commanded: NDArray[np.bool_]
     shorter_s: FloatArray
-    """How far the loop delay may be from the assumed delay, (n, sets): see `gcs.plan.mismatch.Tolerated`."""
+    """How much shorter or longer than assumed the loop delay may be, (n, sets): see `gcs.plan.mismatch.Tolerated`."""
     longer_s: FloatArray
     repeated_s: FloatArray
     """See `gcs.control.loop_delay.repeated_s`."""
@@ -45,19 +45,19 @@ class Tick(NamedTuple):
     due_ns: int
     key_ms: int
     judged: Judged | None
-    """None until its set-points are sent, if kernels have made them."""
+    """None until the set-points are sent, if kernels have made them."""
     set_point_indices: IntArray
-    """For each vehicle the index of its set-point among the datagrams of the step; -1 if it was sent none."""
+    """For each vehicle, the index of its set-point among the datagrams of the step; -1 if it was sent none."""
 
 
 def tick_rows(
     tick: Tick, judged: Judged, links: Links, nearest_m: FloatArray, sent_ns: NDArray[np.int64]
 ) -> tuple[TickArray, FloatArray]:
-    """The rows of a tick, and how much of its margin each vehicle uses.
+    """The rows of a tick, and how much of its margin each vehicle uses, in s.
 
-    `nearest_m` holds each vehicle's distance to the nearest other, NaN while unknown, and `sent_ns` when its set-point
-    was handed to the kernel. What is used is in s, see `gcs.plan.mismatch.used_s`: the loop delay, or the mismatch with
-    prediction.
+    `nearest_m` holds each vehicle's distance to its nearest neighbour, NaN while unknown, and `sent_ns` when its
+    set-point was handed to the kernel. The part of the margin used is the loop delay, or with prediction the mismatch:
+    see `gcs.plan.mismatch.used_s`.
     """
     rows, used = np.empty(len(sent_ns), TICK), np.empty(len(sent_ns))
     fill(rows, used, links.known, links.clocks.known, links.counters, judged, nearest_m, sent_ns, *tick[:4])
@@ -72,7 +72,7 @@ def fill(
     most_s = 0.0
     for k in range(len(rows)):
         bound_s = judged.reported[k].bound_s
-        most_s = bound_s if bound_s > most_s else most_s  # NaN, of a state that is not known, is passed over
+        most_s = bound_s if bound_s > most_s else most_s  # skips NaN, the bound of an unknown state
     for k in range(len(rows)):
         row, control, reported = rows[k], judged.controls[k], judged.reported[k]
         clock, counter, own_ns = clocks[k], counters[k], sent_ns[k]
@@ -97,7 +97,7 @@ def fill(
         if down_ns != UNKNOWN:
             down_s, down_bound_s = down_ns * 1e-9, clock.down_bound_ns * 1e-9
             loop_bound_s = clock.loop_bound_ns * 1e-9
-            if control.used_ns != control.sample_ns:  # of another vehicle's clock, whose error adds to this one's
+            if control.used_ns != control.sample_ns:  # timed by another vehicle's clock: both errors add
                 loop_bound_s = most_s + down_bound_s
         row.down_delay_s, row.down_bound_s, row.loop_delay_bound_s = down_s, down_bound_s, loop_bound_s
         row.clock_offset_s = row.clock_offset_bound_s = nan
@@ -108,7 +108,7 @@ def fill(
         repeated_s = judged.repeated_s[k]
         loop_s = _loop_delay_s(control.used_ns, own_ns, down_s, repeated_s)
         margin_s = judged.longer_s[k, judged.gain_set[k]]
-        # the age of a state is known, so only a set-point that acts at another instant than assumed is a mismatch
+        # the age of a state is known, so only the set-point can be mismatched: it acts at another instant than assumed
         mismatch_s = (own_ns - control.acts_ns) * 1e-9 + down_s if control.acts_ns > 0 else loop_s
         used[k] = _used_s(judged.shorter_s[k, judged.gain_set[k]], margin_s, mismatch_s)
         row.loop_delay_s, row.repeated_s, row.rtt_s = loop_s, repeated_s, judged.rtt_s[k]

@@ -1,9 +1,9 @@
-"""A station's usual step, and its usual tick, in one kernel each: nothing happens that Python has to see to.
+"""The fast path of a station: the usual step and the usual tick, one kernel each, in which nothing needs Python.
 
-Usual are the datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation whose
-loop the station closes without prediction: in flight, if every vehicle is heard, guided and at ease; before and after
-the flight, while the station only waits for answers. They are made of the same kernels as the steps in Python, which
-take over wherever these stop.
+Usual are the common datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation
+whose loop the station closes without prediction: in flight, if every vehicle is heard, guided and at ease; before and
+after the flight, while the station only waits for answers. These steps call the same kernels as the steps in Python,
+which take over wherever these stop.
 """
 
 from math import inf, isfinite, isnan
@@ -42,19 +42,19 @@ SCHEDULE = np.dtype(
     [
         ("now_ns", "i8"), ("next_tick_ns", "i8"), ("next_heartbeat_ns", "i8"),
         ("next_requests_ns", "i8"), ("next_timesync_ns", "i8"),  # the next wake-up for requests, and the next request
-        ("timesync_row", "i8"),  # whom it asks
+        ("timesync_row", "i8"),  # the vehicle to which the next request goes
         ("tick_count", "i8"),
         ("start_ns", "i8"), ("period_ns", "i8"), ("timesync_spacing_ns", "i8"), ("requests_apart_ns", "i8"),
     ]
 )  # fmt: skip
-"""When a station does what."""
+"""The station's timetable: when each periodic task is next due."""
 DONE, WITH_TICK, NOT_TAKEN, NOT_DONE, NOT_JUDGED = range(5)
-"""How far a step came: it is done; with the rows of its tick; only some of its datagrams are taken in; these are, but
-nothing else is done; it is done but for the rows of its tick, as the formation may be broken."""
+"""Outcome of a step: done; done with the rows of its tick; only some of its datagrams processed; all of them processed,
+but nothing else done; done except for the rows of its tick, because the formation may be broken."""
 
 
 class TickLimits(NamedTuple):
-    """What a tick is judged by."""
+    """Limits and parameters of a tick."""
 
     acceleration_m_s2: float
     silence_ns: int
@@ -66,7 +66,7 @@ class TickLimits(NamedTuple):
 
 
 def limits_of(plan: FlightPlan) -> TickLimits:
-    """What the ticks of a plan are judged by."""
+    """The limits and parameters of a plan's ticks."""
     scenario, safety = plan.scenario, plan.scenario.safety
     return TickLimits(
         scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, round(SILENCE_S * NS_PER_S),
@@ -76,7 +76,7 @@ def limits_of(plan: FlightPlan) -> TickLimits:
 
 
 class Scratch(NamedTuple):
-    """What a usual tick computes of n vehicles."""
+    """Buffers for the results of a usual tick for n vehicles."""
 
     controls: Records
     """Of `gcs.control.law.CONTROL`."""
@@ -91,7 +91,7 @@ def new_scratch(n: int) -> Scratch:
 
 
 class Usual(NamedTuple):
-    """All that usual steps work on, of n vehicles."""
+    """All data of n vehicles on which usual steps work."""
 
     schedule: Records
     """Of SCHEDULE, (1,)."""
@@ -114,11 +114,11 @@ class Usual(NamedTuple):
 
 
 DUE = np.dtype([("flying", "?"), ("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")], align=True)
-"""What Python knows of a tick to come: whether the formation is flown, its scenario time, the nominal velocity then."""
+"""Data of a future tick from Python: whether the formation is flown, its scenario time, its nominal velocity."""
 
 
 class Sending(NamedTuple):
-    """Frames of equal width to vehicles: frame k is the first `sizes[k]` bytes of `frames[k]`, to the one in a row."""
+    """Frames to vehicles: frame k is the first `sizes[k]` bytes of `frames[k]` and goes to the vehicle `rows[k]`."""
 
     frames: Bytes
     sizes: Ints
@@ -129,11 +129,11 @@ class Sending(NamedTuple):
 def usual_step(
     usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Record, known: bool, rows: Records
 ) -> tuple[int, int, Sending, Sending, Sending]:
-    """Do a step at `now_ns` of the schedule as far as it is usual.
+    """Do the usual part of a step at the schedule's `now_ns`.
 
-    Stream, table and `queued_ns` are those of `Arrivals`. Returns how far it came, how many datagrams are taken in, and
-    what is sent, in order. `due`, of DUE, is the tick that is due next: `known` says whether a kernel may do it, as far
-    as Python knows. If not, nothing else is known of it. `rows` are those of the tick.
+    Stream, table and `queued_ns` are those of `Arrivals`. Returns the outcome, how many datagrams were processed, and
+    the frames to send, in order. `due`, of DUE, is the next tick. `known`: Python has filled it in and allows a kernel
+    to do that tick. `rows` receives the rows of the tick.
     """
     schedule, tables = usual.schedule[0], usual.tables
     nothing, taken = _nothing(), 0
@@ -168,7 +168,7 @@ def usual_step(
 
 @array_kernel
 def _answered(tables: Tables) -> Sending:
-    """Answer the requests of vehicles, which are the only news."""
+    """Answers to the vehicles' requests, which are the only news."""
     count = tables.news_count[0]
     frames, sizes, rows = (
         np.zeros((count, TIMESYNC_FRAME_BYTES), np.uint8),
@@ -191,7 +191,7 @@ def _nothing() -> Sending:
 
 @array_kernel
 def requested(schedules: Records, known: Records, clocks: Records, pending_ns: Array) -> tuple[Bytes, Ints, Ints]:
-    """Ask the vehicles whose turn has come for the time on their clocks; returns what `ask` does."""
+    """Make TIMESYNC requests to the vehicles whose turn it is; returns the result of `ask`."""
     schedule = schedules[0]
     due = max(0, (schedule.now_ns - schedule.next_timesync_ns) // schedule.timesync_spacing_ns + 1)
     first = schedule.timesync_row
@@ -203,7 +203,7 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 @kernel
 def _is_calm(usual: Usual, due: Record) -> bool:
-    """Whether the monitor has nothing to do but to note delays and times; they are noted only then."""
+    """Whether the monitor only has to record delays and times; if so, it records them."""
     limits, silent, judged = usual.limits, usual.scratch.silent, usual.watched.judged[0]
     for row in range(len(silent)):
         silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
@@ -217,7 +217,7 @@ def _is_calm(usual: Usual, due: Record) -> bool:
 
 @array_kernel
 def usual_set_points(usual: Usual, due: Records) -> tuple[bool, Sending]:
-    """Decide and command the tick due now, DUE (1,); if it is not usual, False and nothing, and nothing is done."""
+    """Make the set-points of the tick due now, DUE (1,). If it is not usual, nothing is done and False is returned."""
     if not _is_calm(usual, due[0]):
         return False, _nothing()
     set_points, _ = _command(usual, due[0])
@@ -226,10 +226,10 @@ def usual_set_points(usual: Usual, due: Records) -> tuple[bool, Sending]:
 
 @array_kernel
 def _command(usual: Usual, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
-    """The set-points of the tick due now, and which vehicles are to follow the control law."""
+    """The set-points of the tick due now, and which vehicles follow the control law."""
     schedule, limits, tables, law = usual.schedule[0], usual.limits, usual.tables, usual.law
     controls, points, due_ns = usual.scratch.controls, usual.scratch.points, schedule.next_tick_ns
-    ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ones are skipped
+    ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ticks are skipped
     schedule.next_tick_ns = due_ns + ticks * schedule.period_ns
     schedule.tick_count += ticks
     times_ns, states = every_newest(tables.reports, tables.report_counts)
@@ -255,7 +255,7 @@ def _key_ms(schedule: Record, due_ns: int) -> int:
 
 @array_kernel
 def _tick(usual: Usual, due: Record, rows: Records) -> tuple[Sending, bool]:
-    """The tick due now; returns the set-points, and whether the rows are filled, as the formation is not broken."""
+    """Do the tick due now. Returns its set-points, and False if `rows` are not filled: the formation may be broken."""
     schedule, limits, tables, controls = usual.schedule[0], usual.limits, usual.tables, usual.scratch.controls
     due_ns, number = schedule.next_tick_ns, schedule.tick_count
     set_points, followed = _command(usual, due)
@@ -284,7 +284,7 @@ def _tick(usual: Usual, due: Record, rows: Records) -> tuple[Sending, bool]:
 
 @array_kernel
 def commanded(controls: Records, released: Array, flying: bool) -> NDArray[np.bool_]:
-    """Which vehicles are to follow the control law."""
+    """Which vehicles follow the control law: in flight, not released, with a finite command."""
     found = np.empty(len(controls), np.bool_)
     for row in range(len(controls)):
         command = controls[row].command_m_s2
