@@ -24,7 +24,7 @@ class Fleet:
     """The vehicles of one flight, in formation order: in the air from the beginning, in one common frame.
 
     `report` takes events of vehicles as (kind, text, system id). `law` is the user's own control law, if it is flown.
-    `starts` holds each vehicle's start-up if they begin on the ground.
+    `starts` holds each vehicle's start-up if they begin on the ground. For `strangers` see `LaunchedStartup`.
     """
 
     speaks_mavlink_1_first = False
@@ -33,7 +33,13 @@ class Fleet:
     """Whether a vehicle without set-points holds its velocity; an autopilot's failsafe may be to fly on."""
 
     def __init__(
-        self, plan: FlightPlan, report: Report, law: FlownLaw | None = None, starts: Sequence[Startup] = ()
+        self,
+        plan: FlightPlan,
+        report: Report,
+        law: FlownLaw | None = None,
+        starts: Sequence[Startup] = (),
+        *,
+        strangers: bool = False,
     ) -> None:
         scenario, ids = plan.scenario, plan.formation.system_ids
         self.plan = plan
@@ -42,7 +48,12 @@ class Fleet:
         self.is_usual = type(self.loop) is Loop and not starts
         """Whether steps may take the fast path of `gcs.station.usual`."""
         launched = (
-            LaunchedStartup(scenario.rates.telemetry_hz, self.loop.parameters(key), target_hz=scenario.target_hz)
+            LaunchedStartup(
+                scenario.rates.telemetry_hz,
+                self.loop.parameters(key),
+                target_hz=scenario.target_hz,
+                stranger=strangers and key != scenario.external_id,
+            )
             for key in ids
         )
         self.links = new_links(len(ids))

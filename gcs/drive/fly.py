@@ -13,6 +13,7 @@ from gcs.control.tick import Event
 from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep, prepare
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
+from gcs.drive.takeover import CONNECTED
 from gcs.drive.udp import StationSocket, clock_ns, drive
 from gcs.interrupts import held_back, stop_signals
 from gcs.link.datagram import Frames
@@ -70,7 +71,8 @@ def fly(
             writer = RunWriter(folder)
             _wait_until_ready(observer, folder, asked_to_stop)
             started.enter_context(undisturbed(own_code=plan.law is not None))
-            station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS, stopwatch_ns=time.perf_counter_ns)
+            start_ns = clock_ns() + _START_DELAY_NS
+            station = Station(plan, start_ns=start_ns, stopwatch_ns=time.perf_counter_ns, strangers=fleet == CONNECTED)
             if fleet:
                 writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=record.FLEET, text=fleet))
 

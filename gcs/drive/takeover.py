@@ -20,7 +20,6 @@ from scenarios.schema import NS_PER_S, Scenario
 
 TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
-_SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
 """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even the first
 restarts the minute for which vehicles fly on without a station."""
@@ -50,7 +49,7 @@ class Presence:
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
         said = self._ask(
-            there, mavlink.PARAM_EXT_REQUEST_READ, partial(mavlink.param_request_read, _SCENARIO), _scenario_of
+            there, mavlink.PARAM_EXT_REQUEST_READ, partial(mavlink.param_request_read, mavlink.SCENARIO), _scenario_of
         )
         for system_id in there:
             if (text := said.get(system_id, "")).split(" ")[0] != fingerprint(self._scenario):
@@ -135,8 +134,4 @@ class Presence:
 
 
 def _scenario_of(frame: mavlink.Frame) -> str:
-    """The fingerprint and name of the scenario in a vehicle's answer; "" if the frame is not that answer."""
-    if frame.msg_id != mavlink.PARAM_EXT_VALUE:
-        return ""
-    name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in frame.fields[2:4])
-    return value if name == _SCENARIO else ""
+    return mavlink.scenario_of(frame.fields) if frame.msg_id == mavlink.PARAM_EXT_VALUE else ""

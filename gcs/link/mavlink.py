@@ -35,6 +35,8 @@ POSITION_TARGET_LOCAL_NED = 85
 TIMESYNC = 111
 PARAM_EXT_REQUEST_READ = 320
 PARAM_EXT_VALUE = 322
+SCENARIO = "SCENARIO"
+"""The extended parameter in which a simulated vehicle names its scenario."""
 EKF_STATUS_REPORT = 193
 ESTIMATOR_STATUS = 230
 HOME_POSITION = 242
@@ -246,6 +248,13 @@ def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]
 def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
     """Fields of PARAM_REQUEST_READ, or of PARAM_EXT_REQUEST_READ, by name."""
     return (-1, target_system, 1, name.encode())
+
+
+def scenario_of(fields: tuple[Any, ...]) -> str:
+    """The fingerprint and name of a simulated vehicle's scenario, from the fields of PARAM_EXT_VALUE; "" if of another
+    parameter."""
+    name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in fields[2:4])
+    return value if name == SCENARIO else ""
 
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07

@@ -3,16 +3,21 @@
 `gcs.autopilot.startup` holds the start-up of vehicles with an autopilot.
 """
 
+from math import inf
 from typing import Any, Protocol
 
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Kind, Step, mode_command
 from gcs.link.upload import Upload
+from scenarios.schema import NS_PER_S
 
 OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
 """The message that a vehicle may refuse to send: prediction then assumes that every set-point acts."""
 WITHOUT_TARGET = "does not report its active target"
 """The event text for a vehicle that refuses it."""
+
+_STRANGER = "does not say that it is simulated"
+_STRANGER_PATIENCE_NS, _ASK_AGAIN_NS = 10 * NS_PER_S, NS_PER_S // 2
 
 
 def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:
@@ -28,6 +33,8 @@ class Startup(Protocol):
     """Why the vehicle must not be flown; empty if it may."""
     has_landed: bool = False
     """Whether it has been in the air in this flight and is back on the ground."""
+    stranger: bool = False
+    """Whether the vehicle has yet to say that it is simulated; until then it is commanded nothing."""
     arming_refusals: int = 0
     """Number of refusals to arm since it was last armed."""
 
@@ -66,22 +73,34 @@ class LaunchedStartup(Startup):
     kind = LAUNCHED
 
     def __init__(
-        self, telemetry_hz: float, parameters: dict[str, float] | None = None, *, target_hz: float = 0.0
+        self,
+        telemetry_hz: float,
+        parameters: dict[str, float] | None = None,
+        *,
+        target_hz: float = 0.0,
+        stranger: bool = False,
     ) -> None:
+        self.stranger = stranger
         self._rates = message_rates({mavlink.LOCAL_POSITION_NED: telemetry_hz, OPTIONAL: target_hz})
         self._set = set[float]()
         """The messages whose rates are settled."""
         self._upload = Upload(parameters or {})
+        self._first_asked_ns, self._last_asked_ns = inf, -inf
+        """When a stranger was asked for its scenario."""
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - it is what the scenario says
         return LAUNCHED
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        if msg_id == mavlink.PARAM_VALUE:
+        if msg_id == mavlink.PARAM_EXT_VALUE and mavlink.scenario_of(fields):
+            self.stranger, self.refusal = False, self._upload.refusal
+        if msg_id == mavlink.PARAM_VALUE and not self.stranger:
             self._upload.take(fields)
             self.refusal = self._upload.refusal
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
+        if self.stranger:
+            return Step(self.refusal or _STRANGER)
         guided, uploaded = custom_mode == LAUNCHED.guided_mode, self._upload.done
         due = next(((m, us) for m, us in self._rates.items() if m not in self._set), None)
         command = None
@@ -101,7 +120,15 @@ class LaunchedStartup(Startup):
         return Step(self.refusal or next((text for text, lacking in lacks if lacking), ""), command)
 
     def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        return self._upload.next(now_ns, target_system=target_system, rtt_ns=rtt_ns)
+        if not self.stranger:
+            return self._upload.next(now_ns, target_system=target_system, rtt_ns=rtt_ns)
+        self._first_asked_ns = min(self._first_asked_ns, now_ns)
+        if now_ns - self._first_asked_ns > max(_STRANGER_PATIENCE_NS, 5 * rtt_ns):
+            self.refusal = f'{_STRANGER}, wanted dynamics = "autopilot" for a vehicle with an autopilot'
+        if self.refusal or now_ns - self._last_asked_ns < _ASK_AGAIN_NS:
+            return None
+        self._last_asked_ns = now_ns
+        return mavlink.PARAM_EXT_REQUEST_READ, mavlink.param_request_read(mavlink.SCENARIO, target_system=target_system)
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:  # noqa: ARG002
         if command == SET_MESSAGE_INTERVAL:

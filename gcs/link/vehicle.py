@@ -277,7 +277,7 @@ class RemoteVehicle:
     @property
     def ended(self) -> bool:
         """Whether the vehicle holds or lands, or must not be told to: it is not armed, or somebody else flies it."""
-        if self.external:
+        if self.external or self.startup.stranger:
             return True
         if self.kind.piloted and (self.kind is UNRECOGNISED or not self.armed):
             return True

@@ -10,9 +10,12 @@ from gcs.link.vehicle import Report
 from gcs.plan.flight_plan import FlightPlan
 
 
-def fleet_of(plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> Fleet:
-    """The fleet for which a plan is made; `report` takes events of its vehicles as (kind, text, system id).
+def fleet_of(plan: FlightPlan, report: Report, law: FlownLaw | None = None, *, strangers: bool = False) -> Fleet:
+    """The fleet for a plan; `report` takes events of its vehicles as (kind, text, system id).
 
-    `law` is the user's own control law, if it is to be flown.
+    `law` is the user's own control law, if it is flown. `strangers` must say that they are simulated, unless the plan
+    is for vehicles with autopilots.
     """
-    return AutopilotFleet(plan, report) if plan.scenario.dynamics == "autopilot" else Fleet(plan, report, law)
+    if plan.scenario.dynamics == "autopilot":
+        return AutopilotFleet(plan, report)
+    return Fleet(plan, report, law, strangers=strangers)

@@ -57,7 +57,8 @@ _NEAR = 0.1
 class Station:
     """Flies one formation. `start_ns` is the time of the first control tick.
 
-    `stopwatch_ns` is a clock that times the calls of the user's own control law; None in virtual time.
+    `stopwatch_ns` is a clock that times the calls of the user's own control law; None in virtual time. `strangers`:
+    whether simulated vehicles must say that they are before they are commanded.
     """
 
     next_tick_ns = Cell[int]()
@@ -65,7 +66,14 @@ class Station:
     _next_heartbeat_ns, _next_requests_ns = Cell[int](), Cell[int]()
     _tick_count = Cell[int]()
 
-    def __init__(self, plan: FlightPlan, *, start_ns: int, stopwatch_ns: Callable[[], int] | None = None) -> None:
+    def __init__(
+        self,
+        plan: FlightPlan,
+        *,
+        start_ns: int,
+        stopwatch_ns: Callable[[], int] | None = None,
+        strangers: bool = False,
+    ) -> None:
         scenario = plan.scenario
         rates = scenario.rates
         self.plan = plan
@@ -76,7 +84,7 @@ class Station:
         self.events, self._report, self.scenario_time_s = journal.events, journal.report, journal.scenario_time_s
         """See `Journal`."""
         own = None if plan.law is None else FlownLaw(plan, journal.report, journal.request_stop, stopwatch_ns)
-        self._fleet = fleet_of(plan, journal.report, own)
+        self._fleet = fleet_of(plan, journal.report, own, strangers=strangers)
         self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
         self._period_ns = round(NS_PER_S / rates.control_hz)

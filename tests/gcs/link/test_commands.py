@@ -1,7 +1,7 @@
 """Commands and their answers, which do not say what they answer."""
 
 from gcs.link import mavlink
-from gcs.link.kinds import SET_MESSAGE_INTERVAL
+from gcs.link.kinds import SET_MESSAGE_INTERVAL, Goal
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle, in_words
 from scenarios.schema import NS_PER_S
@@ -53,6 +53,34 @@ def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
         vehicle.heard_ns = k * NS_PER_S
         assert requested(vehicle.next_frame(k * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
     assert "telemetry rate" in vehicle.missing
+
+
+def stranger() -> tuple[RemoteVehicle, list[int]]:
+    """A vehicle that has to say that it is simulated, and the ids of what it is sent in twenty seconds."""
+    vehicle, sent = RemoteVehicle(7, startup=LaunchedStartup(50.0, stranger=True)), list[int]()
+    vehicle.address = "127.0.0.1", 1, 0
+    for k in range(400):
+        vehicle.heard_ns = k * NS_PER_S // 20
+        if (frame := vehicle.next_frame(k * NS_PER_S // 20)) is not None:
+            sent += [parsed.msg_id for parsed in mavlink.decode(frame, {})]  # pyright: ignore[reportArgumentType]
+    return vehicle, sent
+
+
+def test_a_stranger_is_asked_and_commanded_nothing() -> None:
+    vehicle, sent = stranger()
+    assert {*sent} == {mavlink.PARAM_EXT_REQUEST_READ}
+    assert vehicle.startup.refusal.startswith("does not say that it is simulated, wanted")
+    vehicle.goal = Goal.END
+    assert vehicle.next_frame(20 * NS_PER_S) is None
+    assert vehicle.parting_command() is None
+
+
+def test_a_stranger_that_says_it_is_simulated_is_flown() -> None:
+    vehicle, _ = stranger()
+    vehicle.tell_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"OTHER\0", b"0123 trio\0", 11))
+    assert vehicle.next_frame(20 * NS_PER_S) is None
+    vehicle.tell_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"SCENARIO\0", b"0123 trio\0", 11))
+    assert requested(vehicle.next_frame(20 * NS_PER_S)) == mavlink.LOCAL_POSITION_NED
 
 
 def test_a_line_about_many_vehicles_names_ten_of_them() -> None:
