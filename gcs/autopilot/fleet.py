@@ -47,6 +47,8 @@ class AutopilotFleet(Fleet):
         self._report = report
         self._lacks = [("", 0)] * len(self.vehicles)
         """What each vehicle lacks, and since when; the time is 0 once that has been reported."""
+        self._located: set[int] = set()
+        """The rows whose frame has been known."""
         self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
         self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
@@ -110,8 +112,11 @@ class AutopilotFleet(Fleet):
         """Update the origins of the local frames. States reported before their frame moved are dropped."""
         first = next(start for start, vehicle in zip(self.starts, self.vehicles, strict=True) if not vehicle.left_out)
         for row, startup in enumerate(self.starts):
+            if startup.origin is None and row in self._located:  # it has restarted
+                history.forget(row)
             if first.origin is None or startup.origin is None:
                 continue
+            self._located.add(row)
             north, east = between(first.origin, startup.origin)
             known_north, known_east, _ = self.frame_ned_m[row].tolist()
             if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:

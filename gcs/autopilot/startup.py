@@ -50,7 +50,7 @@ class AutopilotStartup(Startup):
         self.origin_altitude_m = 0.0
         """Above sea level; valid only once the origin is known."""
         self.limits = ToldLimits()
-        self._armed = self._standby = self._has_flown = False
+        self._armed = self._standby = self._has_flown = self._restarted = False
         self._text = ""
         """The last text received; cleared by armed heartbeats."""
         self._origin_said = False
@@ -99,7 +99,7 @@ class AutopilotStartup(Startup):
             case mavlink.GPS_GLOBAL_ORIGIN:
                 self.origin, self._origin_said = (fields[0] * 1e-7, fields[1] * 1e-7), True
                 self.origin_altitude_m = fields[2] * 1e-3
-            case mavlink.HOME_POSITION if not self._origin_said and isfinite(sum(fields[3:6])):
+            case mavlink.HOME_POSITION if not (self._origin_said or self.airborne) and isfinite(sum(fields[3:6])):
                 self.origin = shifted((fields[0] * 1e-7, fields[1] * 1e-7), -fields[3], -fields[4])
                 self.origin_altitude_m = fields[2] * 1e-3 + fields[5]
             case _:
@@ -110,7 +110,14 @@ class AutopilotStartup(Startup):
         self._armed, self._standby = bool(base_mode & ARMED), system_status == _STANDBY
         if self._armed:
             self.arming_refusals, self._text = 0, ""
+        self._forget_old_frame()
+        self._restarted = False
         self._judge_ground()
+
+    def _forget_old_frame(self) -> None:
+        """Forget the origin of the local frame if the vehicle has restarted; while it is armed its clock has jumped."""
+        if self._restarted and not self._armed:
+            self.origin, self._origin_said = None, False
 
     def _judge_ground(self) -> None:
         """Decide from the newest heartbeat and altitude whether the vehicle has taken off or landed."""
@@ -174,7 +181,8 @@ class AutopilotStartup(Startup):
 
     def begin_anew(self) -> None:
         self._accepted.clear()
-        self._took_off_ns = None
+        self._took_off_ns, self._restarted = None, True
+        self._forget_old_frame()
 
     def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
         """The request that is due for its limits, which are only read: setting them is up to the owner."""

@@ -301,8 +301,7 @@ class Station:
         behind = (self._journal.now_ns - due_ns) // self._period_ns
         self.next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
         self._decide(due_ns, outgoing)
-        if self.phase is Phase.CONNECTING:
-            self._fleet.locate(self._history)
+        self._fleet.locate(self._history)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
         nominal_m_s = self.plan.scenario.nominal_velocity_at(time_s)

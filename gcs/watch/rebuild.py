@@ -264,8 +264,7 @@ class _Rebuilding:
         sent_ns = max((own_ns for own_ns, _ in commands.values()), default=due_ns)
         time_s = (due_ns - self._start_ns) / NS_PER_S
         flying = bool(commands) and time_s >= 0
-        if not flying:
-            self._fleet.locate(self._history)
+        self._fleet.locate(self._history)
         lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
         if lost != self._lost:
             self._lost, self._law = lost, self._fleet.loop.law(lost)

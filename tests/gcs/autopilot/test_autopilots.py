@@ -4,9 +4,12 @@ import math
 
 import pytest
 
+from gcs.autopilot.fleet import AutopilotFleet
 from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Seen, kind_of, next_step
 from gcs.autopilot.startup import AutopilotStartup, between, shifted
+from gcs.control.history import StateHistory
 from gcs.link.kinds import UNRECOGNISED, Kind, commanded_mode, mode_command
+from tests.support.fleets.flown_copters import plan_for, three
 
 ALTITUDE_M = 20.0
 GOOD = 0x33F
@@ -217,3 +220,28 @@ def test_the_local_height_carries_an_altitude_on_that_is_old() -> None:
     assert startup.relative_altitude_m == 19.6  # reported five times a second: another may follow
     startup.take(32, (11_100, 0.0, 0.0, -19.3, 0.0, 0.0, 0.0))
     assert startup.relative_altitude_m == pytest.approx(20.3)
+
+
+def test_a_restarted_vehicle_has_to_say_its_origin_again() -> None:
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.take(49, (471000000, 81000000, 400_000, 0))
+    for base_mode, known in ((128, True), (0, False)):  # an armed vehicle's clock has only jumped
+        startup.take(0, (2, 3, 0, 128, 4, 3))
+        startup.begin_anew()
+        startup.take(0, (2, 3, 0, base_mode, 4, 3))
+        assert (startup.origin is not None) == known
+
+
+def test_states_in_a_frame_of_before_a_restart_are_dropped() -> None:
+    fleet, history = AutopilotFleet(plan_for(three()), lambda *_: None), StateHistory(3)
+    for startup in fleet.starts:
+        startup.take(49, (471000000, 81000000, 400_000, 0))
+    fleet.locate(history)
+    for row in (1, 2):
+        history.add(row, 10, (1.0, 2.0, 0.0, 0.0))
+    fleet.starts[1].begin_anew()
+    fleet.locate(history)
+    assert [history.newest(row) is None for row in (1, 2)] == [True, False]
+    fleet.starts[1].take(49, (471001000, 81000000, 400_000, 0))
+    fleet.locate(history)
+    assert fleet.frame_ned_m[1, 0] == pytest.approx(11.1, abs=0.1)
