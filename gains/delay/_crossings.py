@@ -168,8 +168,8 @@ def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossin
 def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing:
     """A crossing refined by Newton's method on u*(j w I - sum_k A_k e^{-j k theta}) v = 0.
 
-    u, v are the singular vectors of the least singular value; steps continue while they lower it. If two singular values
-    are small (roots cross together) or both unknowns act alike (near-tangent), the bracketed value is better and kept.
+    u, v are the singular vectors of the least singular value; steps continue while they lower it. If two singular
+    values are small (roots cross together) or both unknowns act alike (near-tangent), the bracketed value is kept.
     """
     omega, theta = crossing.omega, float(np.angle(crossing.locus))
     identity = np.eye(matrices[0].shape[0])
