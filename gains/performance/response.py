@@ -31,7 +31,7 @@ _ORDER = 4
 
 @dataclass(frozen=True)
 class Response:
-    """The response of one vehicle: its `lag_s` > 0 from commanded to real acceleration, and its velocity gain g >= 0.
+    """The response of one vehicle: its `lag_s` > 0 from demanded to real acceleration, and its velocity gain g >= 0.
 
     BadModelError if the lag or the natural frequency is below 1e-6, the gain or the dead time is negative, any of them
     is not finite, or both a dead time and a natural frequency are given.

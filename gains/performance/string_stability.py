@@ -41,7 +41,7 @@ def string_peak(
         Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} ((s K2 e^{−sb} + K3 e^{−sa}) h + s² k_ff I)
 
     a is `delay_s` and b is `front_delay_s`, by default the same, as when a ground station closes every loop. h(jω) is
-    `answer`, from wanted to real acceleration; k_ff is `feed_forward`, the share of the command in front that is added.
+    `answer`, from commanded to real acceleration; k_ff is `feed_forward`, the added share of the command in front.
 
     |1 / (s² + s + 1)| peaks at 2 / √3:
 
