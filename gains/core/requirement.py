@@ -117,8 +117,8 @@ class Requirement:
     """Requirements of a design.
 
     With `delay_margin_s`, the design maximises α and must reach `alpha` and `decay_rate_1_s` if they are given. Without
-    it, the design maximises the delay margin subject to these two. With none of the three, a margin of 0.3 s is
-    required. BadModelError if a number is out of range.
+    it, the design maximises the delay margin subject to these two. With none of the three and no `criteria.at_delay_s`,
+    a margin of 0.3 s is required. BadModelError if a number is out of range.
 
     The default requirement is a delay margin of 0.3 s:
 
