@@ -1,23 +1,23 @@
-"""Control mathematics of formations: gains for an information pattern, and how much delay their loops take.
+"""Control mathematics of formations: gains for an information pattern, and the delay margins of their loops.
 
-The two dozen names below are what most users import; importing one loads only what it needs. The rest is imported from
-the rooms, for example `from gains.formation.pattern import leader_follower`. Each room uses those below it:
+Most users need only the two dozen names below; importing one loads only what it needs. The rest is imported from the
+rooms, for example `from gains.formation.pattern import leader_follower`. Each room uses those above it:
 
-* `core`: requirements, errors, array types, and the splitting of a matrix into blocks that interact.
+* `core`: requirements, errors, array types, and the splitting of a matrix into interacting blocks.
 * `formation`: formation models and information patterns, the inclusion principle, partitions, fixed modes.
-* `delay`: loops with constant delays: every window of stability, the delay margin, the rightmost root, two delays.
-* `sampled`: loops as they are flown: sampled and held, telemetry at another rate, own errors fed back on board.
-* `varying`: delays that change: which of them a loop is proved to take.
+* `delay`: loops with constant delays: stability windows, delay margins, rightmost roots, two independent delays.
+* `sampled`: loops as flown: sampled and held, telemetry at another rate, own errors fed back on board.
+* `varying`: delays that vary: bounds within which a loop is proved stable.
 * `margin`: the engine of `gcs margin`: any linear loop from one description, confirmed by second opinions.
-* `performance`: what given gains do: robustness, growth down the chain, vehicles that respond with a lag.
-* `criteria`: what a design can be asked for beside margin, robustness and decay, as figures of given gains.
+* `performance`: performance of given gains: robustness, growth down the chain, vehicles that respond with a lag.
+* `criteria`: requirements beyond margin, robustness and decay, as figures of given gains.
 * `design`: from a requirement to gains.
 
 A module whose name begins with an underscore is internal. `gains.design` is the function; modules of that room are
 imported as `from gains.design import lqr`. Matrices are arrays or nested lists; A, B and K are those of
 x' = A x + B u, u = +K x. Times are in s, frequencies in rad/s, state matrices in 1/s.
 
-Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling the loop takes half a period more:
+Gains for a leader and two followers with a margin of 0.3 s at 50 Hz; without sampling it is half a period more:
 
 >>> from gains import FormationModel, Requirement, delay_margin, design
 >>> chain = FormationModel((-1, 0, 1))
@@ -29,7 +29,7 @@ Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling 
 import sys
 from types import ModuleType
 
-# that of `typing`, whose import would take far longer than that of this package
+# stands for `typing.TYPE_CHECKING`: importing `typing` would take far longer than importing this package
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gains.core.errors import BadModelError, DisagreementError, GainsError, InfeasibleError, SolverError
@@ -80,7 +80,7 @@ _HOME = {name: f"gains.{module}" for module, names in _NAMES.items() for name in
 
 
 class _Package(ModuleType):
-    """This package; importing the room `gains.design` leaves the name `design` to the function."""
+    """Class of this package: keeps the name `design` for the function when the room `gains.design` is imported."""
 
     def __setattr__(self, name: str, value: object) -> None:
         if not (name in _HOME and isinstance(value, ModuleType)):

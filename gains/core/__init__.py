@@ -1,1 +1,1 @@
-"""What all other rooms use: array types, errors, blocks of a matrix, roots in brackets, semidefinite programs."""
+"""Shared by all other rooms: array types, errors, blocks of a matrix, bracketed roots, semidefinite programs."""

@@ -1,7 +1,7 @@
 """Roots and peaks of scalar functions within brackets.
 
-Most functions here evaluate all abscissae (k,) at once: nearly all the time is spent in eigenvalue problems, which each
-step then solves in one batch.
+Most functions here evaluate all abscissae (k,) at once: eigenvalue problems take nearly all the time, and each step
+then solves them in one batch.
 """
 
 from collections.abc import Callable
@@ -14,18 +14,18 @@ Functions = Callable[[FloatArray], FloatArray]
 
 _EPS = float(np.finfo(np.float64).eps)
 _GOLDEN = (3.0 - 5.0**0.5) / 2.0
-# 60 steps shrink a bracket to 1e-13: enough for a kink; a smooth peak is known to 1e-8 only
+# 60 steps shrink a bracket to 1e-13: enough for a kink; the abscissa of a smooth peak is known to only 1e-8 anyway
 _GOLDEN_STEPS = 60
-# closer looks at a peak: how many at most, and where, as shares of the last one
+# refinements of a peak: at most this many, each sampled at these fractions of its bracket
 _LOOKS, _SHARES = 14, np.linspace(0.0, 1.0, 17)
 # a peak exceeds its highest sample by less than this many times the difference of neighbouring samples
 _REACH = 4.0
-# most steps of false position, reached where the function is too rough for the resolution
+# limit on steps of false position, reached when the function is too rough for the resolution
 _FALSE_POSITIONS = 30
 
 
 def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Places of the local maxima of functions with one maximum in [a, b] each, by golden section."""
+    """Abscissae of the maxima of functions that each have one maximum in [a, b], by golden section."""
     c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
     at_c, at_d = function(c), function(d)
     for _ in range(_GOLDEN_STEPS):
@@ -39,7 +39,7 @@ def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
-    """Place and height of the largest value on a rising grid, with those local maxima refined that may exceed it."""
+    """Abscissa and value of the maximum over a rising grid; local maxima that may exceed the largest are refined."""
     values = function(grid)
     best = int(np.argmax(values))
     place, height = float(grid[best]), float(values[best])
@@ -59,10 +59,10 @@ def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
 
 
 def may_reach_zero(points: FloatArray, values: FloatArray) -> BoolArray:
-    """Where a local maximum below zero of samples (k, r) of r functions may hide a zero, shape (k - 2, r).
+    """Mask (k - 2, r) of the local maxima below zero, in samples (k, r) of r functions, that may hide a zero.
 
     A smooth peak exceeds its highest sample by an eighth of its height above the neighbours; a kink by as much as the
-    line through one neighbour rises over the other step. A neighbour at the same point says nothing.
+    line through one neighbour rises over the other step. A neighbour at the same abscissa is ignored.
     """
     inner, left, right = values[1:-1], values[:-2], values[2:]
     before, after = np.diff(points)[:-1, np.newaxis], np.diff(points)[1:, np.newaxis]

@@ -1,7 +1,7 @@
-"""Search for the best point of a function that has kinks, by the adaptation of a normal distribution (CMA-ES).
+"""Minimisation of functions with kinks by evolution of a normal distribution (CMA-ES).
 
-Points are only compared, never differentiated: a peak over frequencies, a rightmost root or a limit that is just met
-has no derivative at the optimum. Draws are seeded, so that the same search finds the same point.
+The search compares points and takes no derivatives: a peak over frequencies, a rightmost root or an active limit has
+none at the optimum. Draws are seeded, so the same search finds the same point.
 
 Source: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with its default constants.
 """
@@ -12,11 +12,11 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 
-# standard deviation of the draws along their longest axis below which the search ends
+# the search ends when the standard deviation of the draws along their longest axis falls below this
 _RESOLUTION = 1e-7
 
 Rank = tuple[float, float]
-"""What a point is worth, less being better: how far it is from what must hold (0 if it holds), then its cost."""
+"""Merit of a point, the smaller the better: how far it violates the constraints (0 if all hold), then its cost."""
 
 
 def best_of(
@@ -24,8 +24,8 @@ def best_of(
 ) -> tuple[FloatArray, Rank]:
     """Return the best point found from `start` (n,) and its rank.
 
-    `step` is the standard deviation of the first draws along every axis. About as many points are looked at as
-    `evaluations` says, and fewer once steps are small.
+    `step` is the standard deviation of the first draws along every axis. About `evaluations` points are evaluated,
+    fewer if the draws contract sooner.
 
     >>> point, _ = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
     >>> (point**2).round(3).tolist()

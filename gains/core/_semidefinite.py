@@ -1,8 +1,8 @@
-"""Semidefinite programs: modelled with cvxpy, solved by Clarabel, and proved by plain linear algebra.
+"""Semidefinite programs: modelled with cvxpy, solved by Clarabel, verified by plain linear algebra.
 
-A status is not a proof. `solved` accepts only "optimal", and its callers check the certificate again.
-`positive_definite_solution` checks its solution itself, whatever the status. Calling Clarabel without cvxpy gives the
-same bounds of `gains.varying` to the last bit, seven of them in 11 s instead of 21 s: not worth a second path.
+A solver status is not a proof. `solved` accepts only "optimal", and its callers verify the certificate themselves.
+`positive_definite_solution` verifies its own solution, whatever the status. Calling Clarabel without cvxpy gives the
+same bounds in `gains.varying` to the last bit, seven of them in 11 s instead of 21 s: not worth a second code path.
 """
 
 import warnings
@@ -26,7 +26,7 @@ _EPS = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class SolverFacts:
-    """What the optimiser did: enough to repeat the run and to see that it ended as it should.
+    """Record of an optimiser run: enough to repeat it and to see that it ended properly.
 
     `variables` and `constraints` count the scalars of the problem as modelled.
     """
@@ -63,7 +63,7 @@ class Unknown:
 
 
 def solved(problem: Any, *, advice: str) -> SolverFacts:
-    """Solve a cvxpy problem with Clarabel; every status but "optimal" is a SolverError that ends with the advice."""
+    """Solve a cvxpy problem with Clarabel; any status but "optimal" raises a SolverError that ends with `advice`."""
     from importlib.metadata import version
 
     import cvxpy as cp
@@ -87,22 +87,22 @@ def _run(problem: Any, *, tolerance: float, **settings: float) -> None:
     import cvxpy as cp
 
     tolerances = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), tolerance)
-    # cvxpy warns of an inaccurate solution, which is judged by its status or its certificate
+    # silence cvxpy's warning of an inaccurate solution: its status or certificate is checked instead
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         problem.solve(solver=cp.CLARABEL, **tolerances, **settings)
 
 
 def negative(matrix: Any, slack: Any) -> Any:
-    """Constraint matrix ⪯ −slack; the mean with the transpose tells cvxpy what it cannot see: that it is symmetric."""
+    """Constraint matrix ⪯ −slack; averaging with the transpose shows cvxpy that the matrix is symmetric."""
     return (matrix + matrix.T) / 2 + slack << 0
 
 
 def positive_definite_solution(unknowns: Sequence[Unknown], inequalities: Inequalities) -> list[FloatArray] | None:
-    """Values of the unknowns, entries up to 1, that make every matrix positive definite; None if none were found.
+    """Unknowns with entries in [-1, 1] that make every matrix positive definite; None if none were found.
 
-    The solver maximises the least eigenvalue. Its solution counts if numpy finds the matrices positive definite there;
-    None does not prove that there is no solution. `inequalities` maps the unknown matrices, in the order of `unknowns`,
+    The solver maximises the least eigenvalue. Its solution counts only if numpy finds the matrices positive definite;
+    None does not prove that no solution exists. `inequalities` maps the unknown matrices, in the order of `unknowns`,
     to symmetric matrices; it is linear and homogeneous.
     """
     import cvxpy as cp

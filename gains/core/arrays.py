@@ -1,4 +1,4 @@
-"""Array types that the signatures of all packages use, and norms of many matrices at once."""
+"""Array types used in the signatures of all packages, and norms of stacks of matrices."""
 
 from typing import Any
 
@@ -13,9 +13,9 @@ IntArray = NDArray[np.intp]
 
 
 def spectral_norms(matrices: NDArray[Any]) -> FloatArray:
-    """Largest singular value of each of matrices (k, m, n), shape (k,).
+    """Largest singular value of each matrix in a stack (k, m, n), shape (k,).
 
-    That of a single row or column is its length, which takes a tenth of the time of a decomposition.
+    A single row or column is measured by its length, in a tenth of the time of a decomposition.
     """
     if min(matrices.shape[1:]) == 1:
         return np.sqrt((np.abs(matrices) ** 2).sum(axis=(1, 2)))

@@ -2,9 +2,9 @@
 
 ValueError
 └── GainsError             what `gains` raises on purpose
-    ├── BadModelError      an argument is not what was wanted: its shape, its sign, not finite
+    ├── BadModelError      an argument has a wrong shape, sign or type, or is not finite
     ├── InfeasibleError    the design problem has no solution for the data given
-    ├── SolverError        the optimiser stopped without a solution that can be trusted
+    ├── SolverError        the optimiser stopped without a trustworthy solution
     └── DisagreementError  independent methods give different answers to one question
 """
 
@@ -14,7 +14,7 @@ class GainsError(ValueError):
 
 
 class BadModelError(GainsError):
-    """An argument is not what was wanted; the message names what was read and what was wanted."""
+    """An argument is invalid; the message states the value read and the value wanted."""
 
 
 class InfeasibleError(GainsError):
@@ -22,8 +22,8 @@ class InfeasibleError(GainsError):
 
 
 class SolverError(GainsError):
-    """The optimiser stopped without a solution that can be trusted; the message names its status."""
+    """The optimiser stopped without a trustworthy solution; the message names its status."""
 
 
 class DisagreementError(GainsError):
-    """Independent methods give different answers to one question; the message lists the answer of each."""
+    """Independent methods give different answers to one question; the message lists each answer."""

@@ -1,4 +1,4 @@
-"""What a design must reach, and the plain types in which designs are written to JSON.
+"""Requirements of a design, and conversion to the plain types that JSON holds.
 
 `gains.design.design` turns a requirement into gains.
 """
@@ -14,18 +14,18 @@ import numpy as np
 from gains.core.errors import BadModelError
 
 DEFAULT_DELAY_MARGIN_S = 0.3
-# Below this α, and above this margin, the numbers in a proof spread too far for the solver.
+# below this α, and above this margin, the numbers in a proof span too many decades for the solver
 ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
 
 
 @dataclass(frozen=True)
 class ChainLimit:
-    """How much spacing errors may grow from one vehicle to the next, and the loop in which they do."""
+    """Limit on the growth of spacing errors from one vehicle to the next, and the loop it applies to."""
 
     peak: float | None = None
-    """None: without limit."""
+    """Largest growth; None for no limit."""
     loop: Literal["ground", "onboard"] = "ground"
-    """On board only the errors of others are late."""
+    """The loop that is flown. On board, only the errors of other vehicles are late."""
     feed_forward: float = 0.0
     """Share of the command of the vehicle in front that each follower adds to its own."""
 
@@ -38,21 +38,21 @@ Objective = Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_
 
 @dataclass(frozen=True)
 class Criteria:
-    """What a design must reach besides the parts of `Requirement`; None is no requirement.
+    """Requirements of a design beyond those of `Requirement`; None means not required.
 
-    A figure at a delay is that of the loop as flown (`gains.performance.flown`): late by the delay and half a control
-    period, or with `discrete` held for one. BadModelError if a number is out of its range, or a figure at a delay is
-    asked for without the delay.
+    A figure at a delay belongs to the loop as flown (`gains.performance.flown`): delayed by the loop delay and half a
+    control period, or with `discrete` held for a period. BadModelError if a number is out of range, or a figure at a
+    delay is required without `at_delay_s`.
 
     >>> Criteria(at_delay_s=0.3, alpha_at_delay=0.5).objective, Criteria(damping_min=0.7).objective
     ('alpha_at_delay', None)
     """
 
     at_delay_s: float | None = None
-    """Loop delay (s) of the figures at a delay. Gains are then searched for this delay."""
+    """Loop delay (s) at which the figures at a delay are judged. Gains are then searched for this delay."""
     maximise: Objective | None = None
-    """The figure that is made best among the gains that meet the rest. If None: `alpha_at_delay` if there is a delay,
-    otherwise as `Requirement` says."""
+    """The figure to maximise among gains that meet the rest. If None: `alpha_at_delay` if `at_delay_s` is given,
+    otherwise the objective described in `Requirement`."""
     alpha_at_delay: float | None = None
     """Least α (1/s) at the delay."""
     decay_rate_at_delay_1_s: float | None = None
@@ -62,19 +62,19 @@ class Criteria:
     natural_frequency_max_rad_s: float | None = None
     """Largest natural frequency |s| of every root without delay."""
     spacing_gain_max_s2: float | None = None
-    """Largest H∞ gain (s²) from disturbing accelerations to spacing errors, at the delay, without one if none is
+    """Largest H∞ gain (s²) from disturbing accelerations to spacing errors: at the delay, or without delay if none is
     given."""
     noise_gain_max: float | None = None
-    """Largest H2 gain from measurement noise to commands: the standard deviation of the noisiest command (m/s²) where
-    every error is measured with white noise of standard deviation 1 (m, m/s), at the delay."""
+    """Largest H2 gain from measurement noise to commands at the delay: the standard deviation of the noisiest command
+    (m/s²) when every error is measured with white noise of standard deviation 1 (m, m/s)."""
     delays_s: tuple[float, float] | None = None
-    """The loop delays (least, largest) between which the loop must be proved stable."""
+    """Range of loop delays (least, largest) over which the loop must be proved stable."""
     delay_rate: float | None = None
-    """How fast the delay varies between them, s/s: 0 if it is constant but not known, None if it jumps."""
+    """Largest rate of change of the delay in that range, s/s: 0 if it is constant but unknown, None if it jumps."""
     discrete: bool = False
     """Whether decay rate and α at the delay are those of the sampled and held loop itself, at any control period."""
     weight: tuple[float, float] | None = None
-    """Weights of spacing errors and of velocity errors, the diagonal of W: every α then bounds |w| ≤ α |W E|."""
+    """Weights of spacing and velocity errors, the diagonal of W: every α is then the bound in |w| ≤ α |W E|."""
 
     def __post_init__(self) -> None:
         _check_positive(self, _POSITIVE)
@@ -95,7 +95,7 @@ class Criteria:
 
     @property
     def objective(self) -> Objective | None:
-        """The figure to make best; None if the rest of the requirement decides it."""
+        """The figure to maximise; None if the rest of the requirement decides it."""
         return self.maximise or ("alpha_at_delay" if self.at_delay_s is not None else None)
 
 
@@ -114,13 +114,13 @@ def _check_positive(record: object, names: Iterable[str]) -> None:
 
 @dataclass(frozen=True)
 class Requirement:
-    """What the design must reach.
+    """Requirements of a design.
 
-    With `delay_margin_s` the design makes α as large as possible, and must reach `alpha` and `decay_rate_1_s` if they
-    are given. Without it, the delay margin is made as large as these two allow. With none of the three, a margin of
-    0.3 s is required. BadModelError if a number is out of its range.
+    With `delay_margin_s`, the design maximises α and must reach `alpha` and `decay_rate_1_s` if they are given. Without
+    it, the design maximises the delay margin subject to these two. With none of the three and no `criteria.at_delay_s`,
+    a margin of 0.3 s is required. BadModelError if a number is out of range.
 
-    A delay margin of 0.3 s is wanted when nothing is given:
+    The default requirement is a delay margin of 0.3 s:
 
     >>> Requirement().delay_margin_s, Requirement(alpha=0.4).delay_margin_s
     (0.3, None)
@@ -131,22 +131,22 @@ class Requirement:
     delay_margin_s: float | None = None
     """Least sampled delay margin, up to 30 s."""
     alpha: float | None = None
-    """Least sector bound, from 5e-4 (1/s)."""
+    """Least sector bound (1/s), at least 5e-4."""
     string_peak_max: float | None = None
     """Limit, at least 1, on the growth of spacing errors from vehicle to vehicle: in the ground loop without delay and
-    at half the margin, in the onboard loop at every delay. 1 lets no error grow down the chain and costs little α. Not
-    limited if None."""
+    at half the margin, in the onboard loop at every delay. With 1 no error grows down the chain, at little cost in α.
+    No limit if None."""
     decay_rate_1_s: float | None = None
     """Least decay rate of the continuous loop without delay, 1/s."""
     loop: Literal["ground", "onboard"] = "ground"
-    """The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
-    vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must have
-    this margin too."""
+    """The loop that is flown. An onboard loop on a pattern without cycles tolerates any delay; `delay_margin_s` then
+    limits each vehicle's own gains as if a ground station closed their loops. On a pattern with cycles the onboard loop
+    must have this margin too."""
     feed_forward: float = 0.0
-    """Share, 0 to 1, of the command of the vehicle in front that each follower adds to its own. It changes no margin
-    and no decay, but alpha and the growth of spacing errors. In the ground loop, by inclusion and without criteria."""
+    """Share, 0 to 1, of the command of the vehicle in front that each follower adds to its own. It changes alpha and
+    the growth of spacing errors, but no margin and no decay. Ground loop only, by inclusion, without criteria."""
     criteria: Criteria | None = None
-    """What else must be reached. Gains are then searched by `gains.design.for_delay`."""
+    """Further requirements. Gains are then searched by `gains.design.for_delay`."""
 
     def __post_init__(self) -> None:
         _check_positive(self, ("delay_margin_s", "alpha", "decay_rate_1_s"))
@@ -173,7 +173,7 @@ class Requirement:
 
 
 def plain(value: Any) -> Any:
-    """`value` with lists and plain numbers in place of arrays, tuples and numpy numbers; None if not finite."""
+    """`value` with arrays and tuples as lists, numpy floats as plain ones, and None in place of non-finite numbers."""
     if isinstance(value, dict):
         return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, np.ndarray):

@@ -1,10 +1,10 @@
-"""Splits a linear model into its blocks of states that interact.
+"""Splitting of a linear model into its blocks of interacting states.
 
 A leader-follower tree is block triangular. Its identical followers share one defective eigenvalue, whose multiplicity
 N is the depth of the tree, and rounding spreads it over a circle of radius eps^(1/N): from about eight vehicles on,
-every method that takes the whole matrix at once returns wrong verdicts. The strongly connected components of the
-pattern are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of theirs, so
-each block is analysed on its own, and equal blocks once.
+every method that works on the whole matrix returns wrong verdicts. The strongly connected components of the pattern
+are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of their spectra, so
+each block is analysed on its own, and equal blocks only once.
 """
 
 import heapq
@@ -23,9 +23,9 @@ from gains.core.errors import BadModelError
 
 @dataclass(frozen=True)
 class Block:
-    """A diagonal block of the triangular form, which stands for all its equal `copies`.
+    """A diagonal block of the triangular form, standing for `copies` equal ones.
 
-    `matrices` are the blocks (n, n) of the given matrices, in their order.
+    `matrices` holds this block (n, n) of each of the given matrices, in their order.
     """
 
     copies: int
@@ -47,7 +47,7 @@ def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
 
 
 def real_matrix(name: str, value: ArrayLike) -> FloatArray:
-    """`value` as a matrix of finite real numbers with at least one entry, or BadModelError with the name."""
+    """`value` as a matrix of finite real numbers with at least one entry; BadModelError names it otherwise."""
     try:
         matrix = np.array(value)
     except ValueError as error:
@@ -62,19 +62,19 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
 
 
 def positive_seconds(name: str, value: float) -> float:
-    """`value` if it is positive and finite, else BadModelError with the name."""
+    """`value` if it is positive and finite; BadModelError names it otherwise."""
     return positive_number(name, value, "number of seconds")
 
 
 def positive_number(name: str, value: float, what: str = "number") -> float:
-    """The same of another quantity."""
+    """`value` if it is positive and finite; otherwise BadModelError says that a positive `what` is wanted."""
     if not (isinstance(value, Real) and np.isfinite(value) and value > 0.0):
         raise BadModelError(f"{name} is {_shown(value)}; a positive {what} is wanted")
     return float(value)
 
 
 def seconds(name: str, value: float) -> float:
-    """`value` if it is finite and not negative, else BadModelError with the name."""
+    """`value` if it is finite and not negative; BadModelError names it otherwise."""
     if not (isinstance(value, Real) and np.isfinite(value) and value >= 0.0):
         raise BadModelError(f"{name} is {_shown(value)}; a number of seconds >= 0 is wanted")
     return float(value)
@@ -87,11 +87,11 @@ def _shown(value: object) -> str:
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     """Index sets of the strongly connected components of the union of the patterns of square matrices.
 
-    State j drives state i where the entry (i, j) of any matrix is not exactly zero. The sets come drivers first, the
-    lowest index first in a tie: in this order of states every matrix is block lower triangular. Indices within a set
+    State j drives state i if the entry (i, j) of any matrix is not exactly zero. Sets are ordered with drivers first,
+    ties by lowest index: in this order of states every matrix is block lower triangular. Indices within a set
     ascend.
 
-    x_1 and x_2 drive each other, x_0 drives both:
+    x_1 and x_2 drive each other, x_0 drives x_1:
 
     >>> [block.tolist() for block in strongly_connected_blocks(np.array([[-1, 0, 0], [1, 0, 1], [0, 1, 0]]))]
     [[0], [1, 2]]
@@ -99,7 +99,7 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     pattern = matrices[0] != 0.0
     for matrix in matrices[1:]:
         pattern |= matrix != 0.0
-    # all drive the first state, which drives all: dense loops
+    # shortcut for dense loops: every state drives the first one and is driven by it
     if bool(pattern[0].all() and pattern[:, 0].all()):
         return [np.arange(len(pattern))]
     driven, driver = np.nonzero(pattern)
@@ -116,14 +116,14 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
 def distinct_blocks(*matrices: RealArray) -> list[Block]:
     """The diagonal blocks of `strongly_connected_blocks`, equal ones listed once with the number of copies.
 
-    Blocks are equal if they are to the last bit, with the states in ascending order. 400 identical followers, described
-    one after the other, give one block.
+    Two blocks are equal if they agree to the last bit with the states in ascending order. 400 identical followers,
+    described one after the other, give one block.
     """
     first: dict[bytes, IntArray] = {}
     copies: dict[bytes, int] = {}
     for indices in strongly_connected_blocks(*matrices):
         rows = indices[:, np.newaxis]
-        # + 0.0 turns -0.0 into 0.0, which is the same number in other bytes
+        # + 0.0 turns -0.0 into 0.0: the same number, but different bytes
         key = b"".join((matrix[rows, indices] + 0.0).tobytes() for matrix in matrices)
         first.setdefault(key, indices)
         copies[key] = copies.get(key, 0) + 1
@@ -136,7 +136,7 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
 def roots_of(A: FloatArray) -> ComplexArray:
     """Return the eigenvalues of A (n, n), those of equal strongly connected blocks once.
 
-    Taken as a whole, equal followers would spoil each other's eigenvalues.
+    Computed from the whole matrix, the eigenvalues of equal followers would spoil each other.
 
     >>> roots_of(np.diag([-1.0, -1.0, -2.0])).real.tolist()
     [-1.0, -2.0]
@@ -148,23 +148,23 @@ def roots_of(A: FloatArray) -> ComplexArray:
 def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
     """The matrices without the directions along which nothing ever acts, and the number of states removed.
 
-    A consensus loses its common value, a formation at constant velocity its position and then its velocity. A direction
-    v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root of det(sI - A_0 - A_1 e^{-s
-    tau} - ...) at s = 0 for every delay. It is split off by an orthonormal basis, in each strongly connected block,
-    until none is left; all other roots stay. A block in which nothing moves at all (an integrator that nobody feeds
-    back) stays as it is. BadModelError unless the matrices are square, finite and of one size.
+    A consensus loses its common value; a formation at constant velocity loses its position, then its velocity. A
+    direction v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root at s = 0 of
+    det(sI - A_0 - A_1 e^{-s tau} - ...) at every delay. Such directions are split off by an orthonormal basis, in each
+    strongly connected block, until none is left; all other roots stay. A block with no other motion (an integrator
+    without feedback) stays as it is. BadModelError unless the matrices are square, finite and of one size.
     """
     checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     moving = [(block.copies, _moving_part(list(block.matrices))) for block in distinct_blocks(*checked)]
     left = sum(copies * len(part[0]) for copies, part in moving)
     if left == len(checked[0]):
-        # with the couplings between blocks, which a reader of the matrices expects
+        # unchanged, couplings between blocks included
         return tuple(checked), 0
     return block_diagonal([part for copies, part in moving for _ in range(copies)]), len(checked[0]) - left
 
 
 def block_diagonal(blocks: Sequence[Sequence[FloatArray]]) -> tuple[FloatArray, ...]:
-    """The matrices, in their order, with the blocks of each one after the other on its diagonal."""
+    """Block diagonal matrices: matrix k has blocks[0][k], blocks[1][k], ... on its diagonal."""
     ends = np.cumsum([len(block[0]) for block in blocks])
     whole = tuple(np.zeros((ends[-1], ends[-1])) for _ in blocks[0])
     for block, end in zip(blocks, ends.tolist(), strict=True):
@@ -175,9 +175,9 @@ def block_diagonal(blocks: Sequence[Sequence[FloatArray]]) -> tuple[FloatArray, 
 
 
 def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
-    """The matrices after one diagonal similarity that evens out the rows and columns of sum |A_k|.
+    """The matrices after a common diagonal similarity that evens out the rows and columns of sum |A_k|.
 
-    With units as different as rad and W, norms and tolerances relative to them say little about the dynamics. The
+    With units as different as rad and W, a norm, and a tolerance relative to it, says little about the dynamics. The
     similarity is exact: its entries are powers of two.
     """
     weight = np.sum([np.abs(matrix) for matrix in matrices], axis=0)
@@ -207,7 +207,7 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
 def is_singular_for_any_delay(matrices: Iterable[FloatArray] | FloatArray) -> bool:
     """Whether the sum of the matrices is singular to rounding: s = 0 is then a root at every delay.
 
-    Each row is judged in its own unit, so a motion that is merely slow beside others does not count as a standstill.
+    Each row is scaled to its own size, so a motion that is merely slow beside others does not count as singular.
     """
     stacked = np.array(list(matrices))
     size = np.linalg.norm(stacked, axis=(0, 2))
@@ -219,15 +219,15 @@ def _complement_of_common_kernel(matrices: list[FloatArray]) -> FloatArray:
     """Orthonormal basis (n, n - k) of the complement of the k-dimensional common kernel of the matrices."""
     stacked = np.vstack(matrices)
     size = np.linalg.norm(stacked, axis=1, keepdims=True)
-    # each row in its own unit, as above
+    # each row scaled to its own size, as above
     _, singular, rows = np.linalg.svd(stacked / np.where(size > 0.0, size, 1.0))
-    # a kernel known to rounding shows at a few eps
+    # a kernel known to rounding has singular values of a few eps
     rank = int(np.count_nonzero(singular > 1e-12 * singular[0]))
     return rows[:rank].T
 
 
 def _projected(matrix: FloatArray, basis: FloatArray) -> FloatArray:
-    """The matrix in the coordinates of an orthonormal basis, with what rounding leaves of zeros set to zero."""
+    """The matrix in the coordinates of an orthonormal basis, with entries at rounding level set to zero."""
     projected = basis.T @ matrix @ basis
     return np.where(np.abs(projected) > 1e-14 * np.abs(matrix).max(), projected, 0.0)
 
@@ -247,7 +247,7 @@ def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
 
 
 def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
-    """Number of the strongly connected component of each state, from edges in ascending order of the driven state.
+    """Label of the strongly connected component of each state, from edges in ascending order of the driven state.
 
     R. Tarjan, "Depth-first search and linear graph algorithms", SIAM J. Comput. 1 (1972), 146-160, without recursion.
     """
@@ -283,7 +283,7 @@ def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
 
 
 def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:
-    """Topological order of components, the component of the lowest state index first in a tie."""
+    """Topological order of components, ties by lowest state index."""
     sorter = TopologicalSorter[int](dict.fromkeys(range(len(lowest_index)), ()))
     for driver, driven in edges:
         sorter.add(driven, driver)

@@ -1,19 +1,19 @@
-"""The largest α that any controller can have through a delay.
+"""The largest α that any controller can reach through a delay.
 
-A vehicle is disturbed by w, |w| ≤ α |E|, and its command acts a time h late: E' = A E + B u(t − h) + w. α is the
-reciprocal of the least ‖E / w‖ that a controller, which knows E, can reach, however large its commands are.
+A vehicle is disturbed by w, |w| ≤ α |E|, and its command acts with a delay h: E' = A E + B u(t − h) + w. α is the
+reciprocal of the least ‖E / w‖ that a controller with knowledge of E can reach, however large its commands.
 
 With X of A'X + X A + I + X (I/γ² − B B'/ε²) X = 0, γ is reached without delay. Completing the squares leaves
 
     ∫ |E|² − γ² |w|² + ε² |u|² dt = ∫ |ε u − F E|² − γ² |w − X E / γ²|² dt,   F = −B'X / ε,
 
-so the command, which knows w only up to t − h, must match F E but for what w does in the last h. That part cannot be
-matched: γ is reached if and only if w → F E over [0, h], E' = (A + X/γ²) E + w from E = 0, has a norm below γ (Sarason:
-the least distance of an operator from those delayed by h is the norm of its compression to [0, h]). That holds if and
-only if the lower right block of exp(t H), H = [[A + X/γ², I/γ²], [−F'F, −(A + X/γ²)']], is regular on (0, h]. ε → 0
-leaves out the price of commands.
+so the command, which knows w only up to t − h, must match F E except for the effect of w in the last h. That part
+cannot be matched: γ is reached if and only if w → F E over [0, h], E' = (A + X/γ²) E + w from E = 0, has a norm below γ
+(Sarason: the least distance of an operator from those delayed by h is the norm of its compression to [0, h]). That
+holds if and only if the lower right block of exp(t H), H = [[A + X/γ², I/γ²], [−F'F, −(A + X/γ²)']], is regular on
+(0, h]. ε → 0 removes the price of commands.
 
-Derived here. For a follower and no price X is known in closed form, with which the tests find the same numbers.
+Derived here. For a follower without price, X is known in closed form; with it, the tests find the same numbers.
 """
 
 from math import inf
@@ -25,21 +25,21 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import positive_number, real_matrix, seconds, square_matrices
 
-# ε of the price of commands as a share of the unit of the states: from here on four digits of α stay the same
+# ε, the price of commands, in units of the states: below this, four digits of α no longer change
 _PRICE = 1e-4
-# instants at which the block must be regular, and halvings of the bracket of γ
+# instants at which the block must be regular, and bisections of γ
 _INSTANTS, _HALVINGS = 100, 40
 _LEAST_GAMMA, _LARGEST_GAMMA = 0.1, 1e4
 
 
 def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = _PRICE) -> float:
-    """Return the α (1/s) that no controller of E' = A E + B u(t − delay) + w exceeds; 0 below 1e-4.
+    """Return the α (1/s) that no controller of E' = A E + B u(t − delay) + w exceeds; 0 if it is below 1e-4.
 
-    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. `price` > 0 is ε; that given
+    A is (n, n), B (n, inputs), of full rank; the delay is in s and includes half a hold. `price` > 0 is ε; the default
     makes α too small by up to 1e-3 of itself. BadModelError if an argument is not as described. Without delay, and
     with as many inputs as states, α is `inf`.
 
-    A follower at 0.31 s, which is 0.3 s of loop delay and half a period of 20 ms; without delay α stays below 1:
+    A follower at 0.31 s (0.3 s of loop delay and half a period of 20 ms), and without delay, where the bound is 1:
 
     >>> A, B = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
     >>> round(alpha_bound(A, B, 0.31), 4), round(alpha_bound(A, B, 0.0), 3)
@@ -58,7 +58,7 @@ def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = 
     low, high = _LEAST_GAMMA, _LARGEST_GAMMA
     if not _is_reached(state, entry, high, delay_s, price):
         return 0.0
-    if _is_reached(state, entry, low, delay_s, price):  # looked at ten times slower, commands cost as little
+    if _is_reached(state, entry, low, delay_s, price):  # in a time unit ten times shorter, at the same price
         return 10.0 * alpha_bound(state / 10.0, entry, 10.0 * delay_s, price=price)
     for _ in range(_HALVINGS):
         middle = (low * high) ** 0.5

@@ -1,4 +1,4 @@
-"""Every figure that a design can be asked for, of given gains at a loop delay."""
+"""All figures on which a requirement can set limits, for given gains at a loop delay."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,10 +26,10 @@ from gains.varying.jitter import spread_bound
 def pole_region(roots: ComplexArray) -> tuple[float, float]:
     """Return the least damping ratio −Re s / |s| and the largest |s| (rad/s) of roots (k,). A root at zero has ratio 0.
 
-    Of a loop without delay: with delay it has infinitely many roots, with ratios down to zero far to the left, of which
-    only the rightmost one counts (`gains.performance.behaviour`).
+    This is for loops without delay: with delay a loop has infinitely many roots, and only the rightmost one counts
+    (`gains.performance.behaviour`).
 
-    s² + s + 1 has roots of magnitude 1 and ratio 1/2:
+    s² + s + 1 has roots of magnitude 1 and damping ratio 1/2:
 
     >>> [round(value, 9) for value in pole_region(roots_of(np.array([[0.0, 1.0], [-1.0, -1.0]])))]
     [0.5, 1.0]
@@ -40,7 +40,7 @@ def pole_region(roots: ComplexArray) -> tuple[float, float]:
 
 
 class FiguresAtOnce:
-    """What holds without any delay, with prediction and without; for dataclasses that have these fields."""
+    """Figures without delay, the same with and without prediction; a mix-in for dataclasses with these fields."""
 
     model: FormationModel
     K: FloatArray
@@ -84,11 +84,11 @@ class FiguresAtOnce:
 
 @dataclass(frozen=True, eq=False)
 class LoopFigures(FiguresAtOnce):
-    """What a formation of one axis is good for with a gain K (inputs, states) of u = K e, each figure when it is read.
+    """Figures of a formation of one axis with a gain K (inputs, states) of u = K e, each computed when it is read.
 
-    Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` is
-    that of spacing errors and of velocity errors, see `gains.core.requirement.Criteria`. Where errors run down a chain
-    of equal followers, `chain` is one of them. Figures without delay do not include a response, but `string_peak` does.
+    Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` holds
+    the weights of spacing and velocity errors, see `gains.core.requirement.Criteria`. If errors run down a chain of
+    equal followers, `chain` is one of them. Figures without delay ignore responses, except `string_peak`.
 
     >>> lone = LoopFigures(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.inf, 0.02), 0.29)
     >>> round(lone.decay_rate_1_s, 6), round(lone.decay_rate_at_delay_1_s, 3), round(lone.alpha_at_delay, 3)
@@ -98,24 +98,24 @@ class LoopFigures(FiguresAtOnce):
     model: FormationModel
     K: FloatArray
     timing: FlownTiming
-    """Its margin is not used."""
+    """Periods and place of the loop; its margin is not used."""
     delay_s: float | None = None
     weight: tuple[float, float] | None = None
     responses: tuple[Response, ...] | None = None
     chain: FlownLoop | None = None
     discrete: bool = False
-    """Whether decay rate and α at the delay are those of the map of one period, in place of half a hold of delay."""
+    """Whether decay rate and α at the delay come from the map of one period, instead of half a hold as delay."""
     thinned: int = 1
-    """In a search figures may be rougher: only every so-manieth frequency is looked at first; 1 is exact."""
+    """Factor by which frequencies are thinned for rougher figures in a search; 1 is exact."""
 
     @property
     def exact(self) -> Self:
-        """The same figures, none of them rough."""
+        """The same figures, computed exactly."""
         return replace(self, thinned=1)
 
     @cached_property
     def delay_margin_s(self) -> float:
-        """Margin of the sampled loop, all feedback late; in searches about that."""
+        """Margin of the sampled loop with all feedback late; approximate in searches."""
         (A, B, K), period_s = formation_loop(self.model, self.K, self.responses), self.timing.period_s
         if self.decay_rate_1_s <= 0.0:
             return 0.0
@@ -151,7 +151,7 @@ class LoopFigures(FiguresAtOnce):
 
     @cached_property
     def spacing_gain_max_s2(self) -> float:
-        """H∞ gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable, 0 of one vehicle."""
+        """H∞ gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable, 0 for one vehicle."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
         if self.model.vehicles == 1:
@@ -169,17 +169,17 @@ class LoopFigures(FiguresAtOnce):
 
     @cached_property
     def string_peak(self) -> float:
-        """Largest growth of a spacing error from vehicle to vehicle, without delay and at the delay; 1 if none runs."""
+        """Largest growth of a spacing error per vehicle, without delay and at the delay; 1 if there is no chain."""
         if self.chain is None:
             return 1.0
         at_once = replace(self.chain, timing=replace(self.timing, period_s=0.0, step_s=0.0, loop="ground"))
         return max(at_once.string_peak(0.0), self.chain.string_peak(self.delay_s or 0.0))
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
-        """How far the loop delay may be from a mean (s) on both sides, both late by half a hold, with the loop stable.
+        """How far (s) the loop delay may deviate from a mean on both sides with the loop proved stable.
 
-        `rate` 0: constant but not known, exact. Any other: proved by `gains.varying.jitter.spread_bound`, in a search
-        estimated. 0 if the loop is unstable at the mean.
+        With a `rate` of 0, the delay is constant but unknown, and the result is exact. Any other is covered by
+        `gains.varying.jitter.spread_bound`, approximately in a search. 0 if the loop is unstable at the mean.
         """
         A, B, K = formation_loop(self.model, self.K, self.responses)
         late = B @ K

@@ -1,4 +1,4 @@
-"""Gains of a loop with delay: H∞ from any frequency response, H2 of what is sampled and held."""
+"""Norms of a loop with delay: H∞ gain of any frequency response, H2 gain of the sampled and held loop."""
 
 from collections.abc import Callable
 
@@ -20,10 +20,10 @@ def peak_gain(
 ) -> float:
     """Return the H∞ gain, the largest singular value of C M(jω)^{-1} B + D over all frequencies (rad/s).
 
-    `characteristic` takes frequencies (k,) to M(jω) (k, n, n), sI less all that acts on the state. The response is read
-    at `frequencies`, which rise and show every peak, and each peak is refined. It is that of a stable loop only.
+    `characteristic` maps frequencies (k,) to M(jω) (k, n, n), which is sI minus everything that acts on the state.
+    `frequencies` must ascend and show every peak; each peak is refined. The result is valid only for a stable loop.
 
-    x' = −x(t − 0.5) + w, z = x + w has gain 2 at rest:
+    x' = −x(t − 0.5) + w, z = x + w has gain 2 at ω = 0:
 
     >>> rest = lambda omega: (1j * omega + np.exp(-0.5j * omega))[:, None, None]
     >>> one = np.eye(1)
@@ -40,18 +40,18 @@ def peak_gain(
 
 
 def noise_gain(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, delay_s: float) -> float:
-    """Return the largest standard deviation of a command where every state is measured with white noise of 1.
+    """Return the largest standard deviation of a command if every state is measured with unit white noise.
 
     u_k = K (x(t_k) + n_k) acts from t_k + `delay_s` for a period. n_k is independent from sample to sample and from
     state to state, so the result is the H2 gain of the sampled loop to its noisiest command, `inf` if it is not
-    asymptotically stable. Arguments and exceptions as of `gains.sampled.constant.period_map`.
+    asymptotically stable. Arguments and exceptions as for `gains.sampled.constant.period_map`.
 
-    x_{k+1} = 0.5 x_k − 0.5 n_k and u = −(x + n): the variance of x is 0.25 / (1 − 0.25), that of u 1 more.
+    With x_{k+1} = 0.5 x_k − 0.5 n_k and u = −(x + n), x has the variance 0.25 / (1 − 0.25) and u 1 more:
 
     >>> round(noise_gain(np.zeros((1, 1)), np.eye(1), -np.eye(1), period_s=0.5, delay_s=0.0) ** 2, 9)
     1.333333333
     """
-    # noise may leave an unstable motion alone, and at the limit of stability its covariance only grows without end
+    # noise may not excite an unstable motion, and at the stability limit the covariance only grows without bound
     if spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s) >= 1.0:
         return float("inf")
     n = len(A)

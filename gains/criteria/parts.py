@@ -1,4 +1,4 @@
-"""The parts of a requirement: what each asks of which figure, how far gains are from it, and how it is relaxed."""
+"""The parts of a requirement: the limit each sets on a figure, the shortfall of gains, and how to relax it."""
 
 from dataclasses import dataclass, replace
 from math import exp, floor, inf, isfinite, log, log10
@@ -9,22 +9,22 @@ from gains.criteria.figures import LoopFigures
 from gains.criteria.predicted import PredictedFigures
 
 Figures = LoopFigures | PredictedFigures
-"""Those of gains without prediction and with it."""
+"""Figures of gains without or with prediction."""
 
 _AT_LEAST = "delay_margin_s", "alpha", "decay_rate_1_s"
 _CRITERIA_AT_LEAST = "alpha_at_delay", "decay_rate_at_delay_1_s", "damping_min"
 _CRITERIA_AT_MOST = "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max"
-# growth of spacing errors that is only rounding
+# relative growth of spacing errors that is only rounding
 _ROUNDING = 1e-9
-# decimals of a second to which an interval of delays is read: its middle must not depend on how narrow it is
+# decimals of a second to which an interval of delays is rounded: its middle must not change as it is narrowed
 _DECIMALS = 12
-# how far an unstable or missing figure counts as being from any requirement, in logarithms
+# shortfall, as a logarithm, of a figure that is not positive or not finite
 _FAR = 1e3
 
 
 @dataclass(frozen=True)
 class Part:
-    """One number that a requirement asks for: the figure `name` of gains must be at least, or at most, `wanted`."""
+    """One limit in a requirement: the figure `name` of gains must be at least, or at most, `wanted`."""
 
     name: str
     wanted: float
@@ -37,17 +37,17 @@ class Part:
 
     @property
     def wanted_text(self) -> str:
-        """What is wanted, in words."""
+        """The limit as text."""
         return f"{self.wanted:.6g}"
 
     def figure(self, figures: Figures) -> float:
-        """What gains reach of it."""
+        """The value of the figure that gains reach."""
         if self.name == "string_peak_max":
             return figures.string_peak / (1.0 + _ROUNDING)
         return getattr(figures, self.name)
 
     def shortfall(self, figures: Figures) -> float:
-        """How far gains are from it, as the logarithm of a ratio; 0 if they meet it."""
+        """How far gains are from the limit, as the logarithm of a ratio; 0 if they meet it."""
         reached = self.figure(figures)
         if (reached >= self.wanted) if self.at_least else (reached <= self.wanted):
             return 0.0
@@ -56,32 +56,32 @@ class Part:
         return abs(log(reached / self.wanted))
 
     def tightened(self, short: float) -> Self:
-        """A part that asks for more, by a shortfall and a little."""
+        """The part with its limit tightened by slightly more than a shortfall."""
         more = exp(1.2 * short + 1e-6) if short > 0.0 else 1.0
         return replace(self, wanted=self.wanted * more if self.at_least else self.wanted / more)
 
     def relaxed(self, figures: Figures) -> Self | None:
-        """A part that asks for no more than gains reach; None if that is nothing."""
+        """The part relaxed to what gains reach; None if that is not positive or not finite."""
         reached = self.figure(figures)
         return self._for(reached) if 0.0 < reached < inf else None
 
     def eased(self, share: float) -> Self:
-        """A part that asks for less, by a share as a logarithm."""
+        """The part relaxed by a share, given as a logarithm."""
         return self._for(self.wanted * exp(-share if self.at_least else share))
 
     @property
     def advice(self) -> str:
-        """What to change of a requirement, so that it asks for this part."""
+        """The change of a requirement that gives it this part."""
         return f"{'lower' if self.at_least else 'raise'} {self.name} to {self.wanted_text}"
 
     def _for(self, reached: float) -> Self:
-        """A part for a value, which it asks for as its text says: rounded to the easier side."""
+        """The part with a limit equal to its text: the value, rounded to the easier side."""
         return replace(self, wanted=float(f"{rounded(reached, up=not self.at_least):.6g}"))
 
 
 @dataclass(frozen=True)
 class DelaysPart(Part):
-    """The interval of delays in which a loop must be proved stable; its figure is the half-width that is proved."""
+    """The interval of delays in which a loop must be proved stable; its figure is the proved half-width."""
 
     mean_s: float
     rate: float
@@ -103,7 +103,7 @@ class DelaysPart(Part):
 
 
 def parts_of(wanted: Requirement) -> list[Part]:
-    """Everything that a requirement asks for, in the order of its fields."""
+    """All parts of a requirement: its own limits, then those of its criteria, the interval of delays last."""
     parts = [Part(name, value, True) for name in _AT_LEAST if (value := getattr(wanted, name)) is not None]
     if wanted.string_peak_max is not None:
         parts.append(Part("string_peak_max", wanted.string_peak_max, False))
@@ -118,7 +118,7 @@ def parts_of(wanted: Requirement) -> list[Part]:
 
 
 def rounded(value: float, *, up: bool) -> float:
-    """Four digits, on the easier side of a value; `inf` and 0 stay."""
+    """The value rounded up or down to four digits; `inf`, zero and negative values stay."""
     if not 0.0 < value < inf:
         return value
     unit = 10.0 ** (floor(log10(value)) - 3)

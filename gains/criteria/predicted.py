@@ -1,30 +1,30 @@
-"""Figures of a loop whose station predicts over an assumed delay: those of `LoopFigures`; feed-forward of commands.
+"""Figures, as in `LoopFigures`, of a loop whose station predicts over an assumed delay; feed-forward of commands.
 
-The station predicts every vehicle over tau^ where the loop delay is tau (`gains.sampled.prediction`). It may also feed
-a share k_ff of the command of the vehicle in front forward, which it has computed in the same tick::
+The station predicts every vehicle over tau^ while the loop delay is tau (`gains.sampled.prediction`). It may also feed
+forward a share k_ff of the command of the vehicle in front, computed in the same tick::
 
     u_i = k_ff u_j + K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
 
-All commands together are u = (I - k_ff N)^{-1} K x^, N being one where i follows j: lower triangular, with the diagonal
-blocks of K. Feed-forward therefore changes neither the roots nor the margin, but who acts on whom. With K2 = -K1 and
-k_ff = 1 the vehicle in front and its follower do the same, and no spacing error arises from it at any delay.
+All commands together are u = (I - k_ff N)^{-1} K x^, with N = 1 where i follows j: lower triangular, with the diagonal
+blocks of K. Feed-forward therefore changes neither the roots nor the margin, only the coupling between vehicles. With
+K2 = -K1 and k_ff = 1 a follower repeats the motion in front exactly, and no spacing error arises at any delay.
 
-A motion that its own command explains is known to the station before it happens. Between two samples it propagates as
+The station knows a commanded motion before it happens. Between two samples it propagates down the chain as
 
     U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),
 
     S(z) = R(z) G + L R(z) (g_tau(z) - g_tau^(z)),   R(z) = (z I - Phi)^{-1},
 
-in which g_tau = (G0 z + G1) z^{-q-1} is the entry of a held command that acts tau late, and L = e^{A tau^} of the
-measured states (`HeldPlant.carry`): exact, and without mismatch free of the delay. Only a motion that no command
-explains is seen late, by the first vehicle behind it.
+where g_tau = (G0 z + G1) z^{-q-1} is the effect of a held command that acts tau late, and L = e^{A tau^} on the
+measured states (`HeldPlant.carry`). This is exact, and independent of the delay without mismatch. Only a motion that no
+command explains is seen late, by the first vehicle behind it.
 
-Noise n in the measurements and disturbances w of the errors lead to
+For the whole formation, noise n in the measurements and disturbances w of the errors give
 
-    u = (I - K S)^{-1} K L (n + R w),   x = R w + R B g_tau u,
+    u = (I - K S)^{-1} K L (n + R w),   x = R w + R B g_tau u.
 
-of the whole formation. For disturbances the loop is continuous, R = (s I - A)^{-1}, and a hold counts as half a period;
-noise is that of the sampled loop.
+For disturbances the loop is continuous, R = (s I - A)^{-1}, and a hold counts as half a period; for noise it is the
+sampled loop.
 """
 
 from dataclasses import dataclass, replace
@@ -46,18 +46,18 @@ from gains.sampled.multirate import Predictor, Timing, multirate_map
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
 _FREQUENCIES, _LOWEST = 1600, 1e-3
-# assumed delays, in periods, below which the continuous loop tells too little of the sampled one
+# assumed delays, in periods, below which the continuous loop approximates the sampled one too poorly
 _SHORT = 4.0
-# of the integral of the noise over the unit circle, which converges like a power of the number
+# angles in the integral of the noise over the unit circle, whose error decays geometrically in their number
 _ANGLES = 4096
-# where motions decay less than by e to this power in twice as many periods, the covariance takes its place
+# if motions decay by less than e to this power in twice as many periods, the covariance is computed instead
 _DECAYED = 25.0
 
 
 def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArray:
     """The gain (inputs, states) of u = K e with `share` of the command of the vehicle in front added to each command.
 
-    A follower gets half the leader's command beside its own gains:
+    Here a follower adds half the leader's command to its own:
 
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> fed_forward(pair, np.array([[-3.0, 0.0, 0.0], [1.0, 2.0, -3.0]]), 0.5).tolist()
@@ -71,14 +71,14 @@ def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArra
 
 @dataclass(frozen=True, eq=False)
 class PredictedFigures(FiguresAtOnce):
-    """What a formation of one axis is good for with a gain K, predicted over `assumed_s`; without prediction it is 0.
+    """Figures of a formation of one axis with a gain K, predicted over `assumed_s`; 0 means without prediction.
 
-    Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles answer at once if they have no
-    `response`. `chain` says that the model is a vehicle and its follower of a chain of equal ones. `feed_forward` is
-    k_ff, which is not part of K. `thinned` is as of `LoopFigures`, and the window of a search that of the continuous
-    loop, unless the delay is short.
+    Figures at a delay are the worst over the true loop delays `delays_s`. Without a `response`, vehicles respond at
+    once. `chain` states that the model is a vehicle and its follower in a chain of equal ones. `feed_forward` is k_ff,
+    which is not part of K. `thinned` is as in `LoopFigures`; the window of a search is that of the continuous loop,
+    unless the delay is short.
 
-    The gains of `triangle5`, assumed and true delay 0.6 s:
+    The gains of `triangle5`, with an assumed and true delay of 0.6 s:
 
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> K = pair.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
@@ -104,12 +104,12 @@ class PredictedFigures(FiguresAtOnce):
 
     @property
     def delay_margin_s(self) -> float:
-        """The longest true loop delay; 0 if the loop is unstable without mismatch."""
+        """The longest stable true loop delay; 0 if the loop is unstable without mismatch."""
         return self.window_s[1] if self.window_s[1] > self.assumed_s else 0.0
 
     @cached_property
     def window_s(self) -> tuple[float, float]:
-        """The least and the largest true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
+        """The least and the largest stable true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
         if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
             timing = Timing(self.period_s, self.period_s)
             return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
@@ -118,9 +118,9 @@ class PredictedFigures(FiguresAtOnce):
         return max(0.0, least_s - half_s), most_s - half_s
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
-        """How far a constant loop delay may be from a mean (s) on both sides; 0 if the mean is not in the window.
+        """How far (s) a constant loop delay may deviate from a mean on both sides; 0 if the mean is not in the window.
 
-        Raises BadModelError for delays that vary: there is no proof for these.
+        Raises BadModelError for delays that vary, for which there is no proof.
         """
         if rate > 0.0:
             raise BadModelError(f"delay_rate is {rate}; 0 is wanted with prediction")
@@ -129,13 +129,13 @@ class PredictedFigures(FiguresAtOnce):
 
     @cached_property
     def decay_rate_at_delay_1_s(self) -> float:
-        """Of the slowest motion of the sampled loop, at the worst of the delays; in searches about that."""
+        """Decay rate of the slowest motion of the sampled loop at the worst delay; approximate in searches."""
         (A, B, K), half_s = self._loop, self.period_s / 2.0
 
         def decay(delay_s: float) -> float:
             if self.decay_rate_1_s <= 0.0:
                 return self.decay_rate_1_s
-            # the loop behind the delay is that without; an error of a computed response decays as that does
+            # the loop behind the delay is that without delay; errors of a computed response decay like the response
             if delay_s == self.assumed_s and (self.response is None or self.thinned > 1):
                 Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
                 return -rate_of(radius_of(Phi + G @ K), self.period_s)
@@ -150,7 +150,7 @@ class PredictedFigures(FiguresAtOnce):
 
     @cached_property
     def alpha_at_delay(self) -> float:
-        """The complex stability radius, as of `gains.performance.flown`; 0 if the loop is unstable."""
+        """The complex stability radius, as in `gains.performance.flown`; 0 if the loop is unstable."""
         heavy, states = self.W, np.eye(self.model.states)
         return 1.0 / gain if (gain := self._peak(heavy, states)) < inf else 0.0
 
@@ -162,10 +162,10 @@ class PredictedFigures(FiguresAtOnce):
 
     @cached_property
     def noise_gain_max(self) -> float:
-        """Standard deviation of the noisiest command where every sampled error has white noise of 1."""
+        """Standard deviation of the noisiest command if every sampled error has unit white noise."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
-        # the angles leave out about as much as noise has decayed after twice as many periods
+        # the error of the sum over angles is about what remains of noise after twice as many periods
         slow = 2 * _ANGLES * self.period_s * self.decay_rate_at_delay_1_s < _DECAYED
         if slow and self.assumed_s + min(self.delays_s) > 0.0:
             return max(self._settled_noise(delay_s) for delay_s in self.delays_s)
@@ -174,7 +174,7 @@ class PredictedFigures(FiguresAtOnce):
 
     @cached_property
     def string_peak(self) -> float:
-        """Largest growth of a commanded motion from vehicle to vehicle; 1 where errors run down no chain."""
+        """Largest growth of a commanded motion from vehicle to vehicle; 1 if there is no chain."""
         if not self.chain:
             return 1.0
         if self.decay_rate_at_delay_1_s <= 0.0:
@@ -183,13 +183,13 @@ class PredictedFigures(FiguresAtOnce):
         return max(1.0, *(self._largest(lambda at, s=s: self.growth(at, s), omega) for s in self.delays_s))
 
     def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
-        """|U_i / U_j| (k,) of the follower at frequencies omega (k,) in rad/s up to pi / `period_s`, if stable."""
+        """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`."""
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
         front, own = (self._loop[2][1] @ self._seen(z, delay_s)).T
         return np.abs((self.feed_forward + front) / (1.0 - own))
 
     def _seen(self, z: ComplexArray, delay_s: float) -> ComplexArray:
-        """S."""
+        """S of the module's docstring, at points z (k, 1, 1)."""
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
         R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
         mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
@@ -199,7 +199,7 @@ class PredictedFigures(FiguresAtOnce):
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
-        """Largest gain from disturbances that act by `entry` to what `out` reads of the errors."""
+        """Largest gain from disturbances that enter through `entry` to the outputs `out` of the errors."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
         (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
@@ -226,7 +226,7 @@ class PredictedFigures(FiguresAtOnce):
         return float((np.abs(commands) ** 2).sum(axis=2).mean(axis=0).max() ** 0.5)
 
     def _settled_noise(self, delay_s: float) -> float:
-        """The same by the stationary covariance of the last commands, with which the map of a period goes on."""
+        """`_noise` from the stationary covariance of the last commands, which are states of the one-period map."""
         n, told = len(self._plant.A), self.model.states
         plant, timing = replace(self._plant, K=self._fed_forward), Timing(self.period_s, self.period_s)
         loop, calm = (
@@ -241,7 +241,7 @@ class PredictedFigures(FiguresAtOnce):
 
     @cached_property
     def _ahead(self) -> FloatArray:
-        """L."""
+        """L of the module's docstring."""
         return self._plant.carry(np.array([self.assumed_s]))[0]
 
     @cached_property
@@ -270,9 +270,9 @@ class PredictedFigures(FiguresAtOnce):
 
 
 def _rough_window(plant: HeldPlant, assumed_s: float, frequencies: int) -> tuple[float, float]:
-    """The window of the continuous loop, from crossings between frequencies on a grid.
+    """The mismatch window of the continuous loop, from crossings interpolated between frequencies on a grid.
 
-    It is at its edge where e^{-s tau} = e^{-s tau^} + 1 / m, m an eigenvalue of K L (s I - A - B K)^{-1} B.
+    At its edges e^{-s tau} = e^{-s tau^} + 1 / m, with m an eigenvalue of K L (s I - A - B K)^{-1} B.
     """
     A, B, K = plant.A, plant.B, plant.K
     closed, onto = A + B @ K, K @ plant.carry(np.array([assumed_s]))[0]

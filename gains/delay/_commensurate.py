@@ -1,12 +1,12 @@
-"""Several delays that are multiples of one unknown: x'(t) = A_0 x(t) + A_1 x(t - tau) + ... + A_m x(t - m tau).
+"""Delays that are multiples of one unknown: x'(t) = A_0 x(t) + A_1 x(t - tau) + ... + A_m x(t - m tau).
 
 With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda. At each frequency its roots lambda are
 the eigenvalues of a block companion matrix: loci like those of one delay (`_loci`). A root is on the imaginary axis
-where a modulus is one, and it moves to the right where that modulus falls with the frequency, whatever the delay.
+where a modulus is one, and it moves to the right if that modulus falls with the frequency, whatever the delay.
 
-The frequencies come from `_crossings` for a single delay (m = 1), else from angles: where an eigenvalue of
+The frequencies come from `_crossings` for a single delay (m = 1), otherwise from angles: where an eigenvalue of
 A(theta) = sum_k A_k e^{-j k theta} is j omega, tau = theta / omega is critical. A matrix pencil gives a finite list of
-angles that contains every crossing. Where it is too large or too ill-conditioned, a grid on the unit circle with
+angles that contains every crossing. If it is too large or too ill-conditioned, a grid on the unit circle with
 refined extrema and Newton's method finds them. Blocks of many states are left to `_tracked`.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634.
@@ -36,27 +36,27 @@ from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_besi
 from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
 from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, without_zero, zero_passage
 
-# loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
+# loci are eigenvalues of many companion matrices; if these are larger than this, the crossings are found by angle
 _LARGEST_LOCI = 30
-# states times the largest multiple: a sweep takes some seconds there
+# limit on states times the largest multiple, where a sweep takes some seconds
 _LARGEST_PRODUCT = 3000
 # the pencil's companion matrix takes 0.1 s at this size; larger problems are left to the grid
 _LARGEST_PENCIL = 450
-# the polynomial in cos(theta) is expanded here: outside [-1, 1], and at no special value
+# the polynomial in cos(theta) is expanded about this point, outside [-1, 1] and otherwise arbitrary
 _EXPANSION = 1.3717
 # grid angles on the upper half of the unit circle: at least this many, and this many per turn of the longest delay. The
-# grid ends a little beyond pi, so that it brackets a crossing at pi itself.
+# grid ends a little beyond pi to bracket a crossing at pi itself.
 _ANGLES, _ANGLES_A_TURN, _PAST_HALF = 400, 40, 1.01 * pi
 # Newton's method starts at grid angles whose first step is at most this many grid steps; each step doubles the digits
 _REACH, _NEWTON_STEPS = 1.5, 3
-# below this share of the highest frequency a root may be one that passes zero: angles this far (rad) beside it tell
+# below this share of the highest frequency a root may be passing zero; angles this far (rad) to each side decide
 _SLOW, _BESIDE = 1e-6, 0.05
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
 
 
 def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
-    """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ...; BadModelError if too large."""
+    """Analyse one block, with matrices A_0, A_1, ..., of x'(t) = sum_k A_k x(t - k tau); BadModelError if too large."""
     longest, states = len(block.matrices) - 1, len(block.matrices[0])
     if longest > 1 and longest * states > _LARGEST_PRODUCT:
         raise BadModelError(
@@ -89,7 +89,7 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
         except UnclearError:
             return _crossings_by_angle(used)
     if len(present) == 1:
-        # one delay of k tau: its angle modulo 2 pi belongs to k angles of tau
+        # a single delay k tau: an angle of k tau modulo 2 pi corresponds to k angles of tau
         [k] = present
         return [
             replace(crossing, delay_s=(crossing.delay_s + 2.0 * pi * turn / crossing.omega_rad_s) / k)
@@ -107,19 +107,19 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
-    """Crossings of one block from the n eigenvalues s of A(theta), however many delays there are.
+    """Crossings of one block from the n eigenvalues s of A(theta), for any number of delays.
 
     With theta = omega tau, a root j omega moves right with growing tau where omega d(Re s) / d theta > 0.
     """
     loci, candidates = circle_loci(terms), _candidate_angles(terms)
     counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, _PAST_HALF)))
     crossings: list[Crossing] = []
-    # opposite crossings at one angle are common: if all multiples are odd, all roots cross at a quarter turn
+    # crossings in opposite directions at one angle are common: if all multiples are odd, all cross at a quarter turn
     for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
         theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
         if passes_zero(terms, theta, abs(omega)):
             continue
-        # angles beyond pi mirror these, with negative frequencies; outward means falling, to the left
+        # angles beyond pi mirror these with negative frequencies; outward means that Re s falls: to the left
         turn, way = (theta, -1) if omega > 0.0 else (2.0 * pi - theta, 1)
         if theta <= pi:
             locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
@@ -128,18 +128,18 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
 
 
 def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
-    """Whether an eigenvalue on the imaginary axis of sum A_k (all of them: `roots`) is a root at every delay."""
+    """Whether some eigenvalue of sum A_k (all are in `roots`) is on the imaginary axis and a root at every delay."""
     scale = norm_of(terms)
     if scale == 0.0:
         return True
     for root in roots[np.abs(roots.real) < 1e-6 * scale]:
         omega = abs(float(root.imag))
         if omega < 1e-6 * scale:
-            # a defective root at zero is known to sqrt(eps) only: the singular value decides, not the eigenvalue
+            # a defective root at zero is known only to sqrt(eps), so the singular value decides, not the eigenvalue
             if is_singular_for_any_delay(terms):
                 return True
-        # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
-        # them, with a tolerance far above rounding
+        # a determinant that vanishes at more angles than its degree vanishes at all angles; three unrelated ones are
+        # checked, with a tolerance far above rounding
         else:
             matrices = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([0.0, 1.0, 2.5]))
             if np.linalg.svd(matrices, compute_uv=False)[:, -1].max() < 1e-12 * scale:
@@ -148,12 +148,12 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
 
 
 def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray) -> Loci:
-    """The function omega (k,) -> all lambda (k, m r) with det(j omega I - sum_i A_i lambda^{-i}) = 0.
+    """A function from omega (k,) to all lambda (k, m r) with det(j omega I - sum_i A_i lambda^{-i}) = 0.
 
-    The late matrices share their column space, A_i = B B'A_i with B (n, r) orthonormal, so that with
-    G_i = B'A_i (j omega I - A_0)^{-1} B the condition is det(lambda^m I - sum_i lambda^{m-i} G_i) = 0.
+    The late matrices share a column space: A_i = B B'A_i with B (n, r) orthonormal. With
+    G_i = B'A_i (j omega I - A_0)^{-1} B the condition is therefore det(lambda^m I - sum_i lambda^{m-i} G_i) = 0.
 
-    `terms_at` takes frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
+    `terms_at` maps frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
     """
     n, rank = B.shape
     identity = np.eye(n)
@@ -179,20 +179,20 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
 
 
 def _candidates(terms: Sequence[FloatArray]) -> FloatArray:
-    """Frequencies that come near every crossing, ascending."""
+    """Ascending frequencies, one of which is near every crossing."""
     theta = _candidate_angles(terms)
     return near_axis(np.linalg.eigvals(at_angle(terms, theta)).astype(np.complex128), terms) if theta.size else theta
 
 
 def norm_of(terms: Sequence[FloatArray]) -> float:
-    """Sum of the Frobenius norms, a bound of every eigenvalue of A(theta)."""
+    """Sum of the Frobenius norms, a bound on every eigenvalue of A(theta)."""
     return sum(float(np.linalg.norm(matrix)) for matrix in terms)
 
 
 def circle_loci(terms: Sequence[FloatArray]) -> Loci:
-    """theta (k,) -> e^{s / scale} for the eigenvalues s of A(theta), scale the sum of the norms.
+    """A function from theta (k,) to e^{s / scale} for the eigenvalues s of A(theta); scale is the sum of the norms.
 
-    The modulus is one on the axis. As |s| / scale <= 1, the frequency can be read from the angle.
+    The modulus is one on the axis. Because |s| / scale <= 1, the frequency can be read from the angle.
     """
     scale = norm_of(terms)
 
@@ -203,15 +203,15 @@ def circle_loci(terms: Sequence[FloatArray]) -> Loci:
 
 
 def circle_points(terms: Sequence[FloatArray]) -> FloatArray:
-    """Grid angles, and the extrema at which a real part comes near the axis and turns back."""
+    """Grid angles, and the angles of extrema at which a real part comes near the axis and turns back."""
     return with_extrema(circle_loci(terms), _grid_angles(terms), near=_NEAR_AXIS)
 
 
 def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
-    """Whether a root at the frequency omega >= 0 is one that passes s = 0, which no finite delay brings about.
+    """Whether a root at the frequency omega >= 0 is an eigenvalue that passes s = 0, to which no finite delay belongs.
 
     An eigenvalue of A(theta) that passes zero is slow at this angle only; the slow motions of a loop are slow at the
-    angles beside it too.
+    neighbouring angles too.
     """
     if omega == 0.0 or omega > _SLOW * highest_frequency(terms):
         return omega == 0.0
@@ -224,7 +224,7 @@ def _grid_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 
 def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
-    """Angles that come near every crossing, ascending.
+    """Ascending angles, one of which is near every crossing.
 
     A well-conditioned pencil (few multiples) misses none. Newton's method starts from each grid eigenvalue whose slope
     leads to the axis; it separates crossings that a count between neighbouring angles cannot.
@@ -247,7 +247,7 @@ def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 
 def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta: zero where an eigenvalue is defective."""
+    """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta; all slopes are 0 if any A is defective."""
     roots, right = np.linalg.eig(at_angle(terms, theta))
     try:
         slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, at_angle(terms, theta, 1) @ right)))
@@ -293,12 +293,12 @@ def _pencil_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 
 def _pencil_at(terms: Sequence[FloatArray], c: float) -> FloatArray:
-    """The equations of `_pencil_angles` at one c as a matrix (n^2, n^2) that acts on the entries of R and S'."""
+    """The equations of `_pencil_angles` at one c: a matrix (n^2, n^2) that acts on the entries of R and S'."""
     n = terms[0].shape[0]
     theta, k, identity = float(np.arccos(c)), np.arange(len(terms)), np.eye(n)
     C = np.tensordot(np.cos(k * theta), np.array(terms), axes=1)
     D = np.tensordot(np.sin(k * theta) / np.sin(theta), np.array(terms), axes=1)
-    # of X, row by row: C X + X C' and D X - X D'
+    # the maps C X + X C' and D X - X D', for X stacked row by row
     plus, minus = np.kron(C, identity) + np.kron(identity, C), np.kron(D, identity) - np.kron(identity, D)
     units = np.eye(n * n).reshape(n * n, n, n)
     upper, strict = (np.ravel_multi_index(np.triu_indices(n, above), (n, n)) for above in (0, 1))

@@ -1,9 +1,9 @@
-"""Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
+"""Crossings of the imaginary axis by roots of x'(t) = A0 x(t) + A1 x(t - tau), found without a grid.
 
 An algebraic test gives a finite list of frequencies near every crossing. Counts of the loci of the loop (`_loci`)
-between these frequencies then tell the number and direction of the crossings and bracket them, however accurate the
-list is. Newton's method on the characteristic matrix gives the last digits, and its sensitivity to rounding their
-error, which at a multiple root is large and alike for every method.
+between these frequencies then give the number and direction of the crossings and bracket them, however inaccurate the
+list is. Newton's method on the characteristic matrix gives the last digits. Its sensitivity to rounding gives their
+error, which at a multiple root is large for any method.
 """
 
 from collections.abc import Sequence
@@ -27,38 +27,38 @@ from gains.delay._loci import (
     without_limits_at_zero,
 )
 
-# n^2 eigenvalues of an n^2 x n^2 matrix: 0.3 s at 20, and growing with the sixth power
+# largest n for eigenvalues of an n^2 x n^2 matrix: 0.3 s at n = 20, growing with the sixth power
 LARGEST_ALGEBRAIC_BLOCK = 24
-# candidates are kept this close to the imaginary axis, relative to the norm: an m-fold eigenvalue is known to
-# eps^(1/m), and a false candidate costs only one evaluation of the loci
+# candidates within this distance of the imaginary axis, relative to the norm, are kept: an m-fold eigenvalue is known
+# to eps^(1/m), and a false candidate costs only one evaluation of the loci
 _CANDIDATE_TOLERANCE = 1e-3
-# a locus this close to one (log of the modulus) at a candidate without a crossing touches one there
+# a locus whose log modulus is this close to zero at a candidate without a counted crossing is a hidden crossing
 _TOUCH = 1e-11
-# least singular value at a crossing, relative to the norm of what it is the sum of: rounding is far below
+# largest least singular value at a crossing, relative to the sum of the norms of the terms: rounding is far below
 _RESIDUAL = 1e-5
 # rad; the angle of a computed unit eigenvalue is known to a few hundred eps
 _ZERO_ANGLE = 1e-11
 # backward error of a crossing, in units of n eps and the norm: rounding of the matrices, a similarity, an eigenvalue
 _BACKWARD = 2.0
-# singular values below this, relative to the norm, belong to roots that cross at one place
+# singular values below this, relative to the norm, belong to roots that cross at the same frequency and delay
 _TOGETHER = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class DelayedTerm:
-    """A x(t - known_s - multiple * tau): `matrix` A (n, n) in 1/s, `multiple` whole."""
+    """The term A x(t - known_s - multiple * tau): `matrix` is A (n, n) in 1/s, `multiple` is whole."""
 
     matrix: FloatArray
     known_s: float
     multiple: int
 
     def delay_s(self, tau_s: float) -> float:
-        """The delay (s) at one value of the unknown."""
+        """The delay (s) of this term for a value of the unknown tau."""
         return self.known_s + self.multiple * tau_s
 
 
 def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
-    """A_0, A_1, ..., A_m of x' = sum_k A_k x(t - k tau), from terms without known delays."""
+    """A_0, A_1, ..., A_m of x' = sum_k A_k x(t - k tau), summed from terms with known_s = 0."""
     alike = [[term.matrix for term in terms if term.multiple == k] for k in range(max(t.multiple for t in terms) + 1)]
     return [sum(rest, first) for first, *rest in (each or [np.zeros_like(terms[0].matrix)] for each in alike)]
 
@@ -69,7 +69,7 @@ class Crossing:
 
     `direction` is +1 if they move into the right half plane as the delay grows, -1 if they move out of it, 0 if they
     touch the axis and return; it is the same for every k. `roots` counts the roots that cross together: 2, times the
-    number of equal blocks. At frequency 0 a single real root passes s = 0, where another one stays: once, at `delay_s`.
+    number of equal blocks. At frequency 0 a single real root passes another that stays at s = 0, once, at `delay_s`.
     """
 
     omega_rad_s: float
@@ -81,9 +81,8 @@ class Crossing:
 def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
     """All crossings of the imaginary axis of one block, omega > 0, in ascending frequency.
 
-    As |e^{j omega tau}| = 1, the root moves right exactly where the modulus of the locus falls with the frequency:
-    with lambda(s) = e^{s tau}, 1 / (ds/dtau) = (d ln lambda / ds - tau) / s, whose real part at s = j omega is
-    -(d ln|lambda| / d omega) / omega.
+    The root moves right exactly where the modulus of the locus falls with the frequency: with lambda(s) = e^{s tau},
+    1 / (ds/dtau) = (d ln lambda / ds - tau) / s, whose real part at s = j omega is -(d ln|lambda| / d omega) / omega.
     """
     B, C = factor_rank(A1)
     if B.shape[1] == 0:
@@ -92,7 +91,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
 
 
 def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: FloatArray) -> list[Crossing]:
-    """All crossings of one block, mere touches included, given frequencies that come near each of them."""
+    """All crossings of one block, touches included, given candidate frequencies near each of them."""
     highest = highest_frequency(terms)
     crossings = unit_crossings(loci, separating_points(candidates, highest))
     found = without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
@@ -101,17 +100,17 @@ def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: Float
 
 
 def near_axis(roots: ComplexArray, terms: Sequence[FloatArray]) -> FloatArray:
-    """The ascending frequencies of those roots that are near the imaginary axis and below the bound of crossings."""
+    """Ascending frequencies of the roots that are near the imaginary axis and below the bound on crossings."""
     highest = highest_frequency(terms)
     omega = np.unique(np.abs(roots.imag[np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))]))
     return omega[(omega > 0.0) & (omega < 1.1 * highest)]
 
 
 def _is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
-    """Whether j omega I - sum_k A_k e^{-j k theta} is singular, at least roughly, at a crossing.
+    """Whether j omega I - sum_k A_k e^{-j k theta} is roughly singular at a crossing.
 
-    Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding, which may cross the
-    unit circle without a root.
+    Near a multiple pole of the resolvent some loci are huge. Small ones beside them are rounding errors, which may
+    cross the unit circle without a root.
     """
     turns = crossing.locus / abs(crossing.locus)
     delayed = sum((matrix * turns**-k for k, matrix in enumerate(matrices)), np.zeros_like(matrices[0]))
@@ -120,7 +119,7 @@ def _is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
 
 
 def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
-    """Ascending frequencies, one of which is at every crossing up to rounding."""
+    """Ascending frequencies, one of which is near every crossing; by a sweep if the block is large."""
     if B.shape[1] == 1:
         roots = unit_gain_roots(A0, B, C)
     elif A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
@@ -144,7 +143,7 @@ def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
 
 
 def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
-    """Frequencies that bracket every candidate narrowly and separate it from its neighbours."""
+    """Ascending frequencies that bracket every candidate narrowly and separate it from its neighbours."""
     lowest = 1e-12 * highest
     middles = (candidates[1:] + candidates[:-1]) / 2.0
     margin = 1e-7 * candidates + 1e-15 * highest
@@ -153,7 +152,7 @@ def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
 
 
 def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
-    """Crossings that leave the count unchanged: two in opposite directions at one frequency, or a touch."""
+    """Crossings that leave the count of moduli unchanged: two in opposite directions at one frequency, or a touch."""
     if candidates.size == 0:
         return []
     values = loci(candidates)
@@ -167,10 +166,10 @@ def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossin
 
 
 def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing:
-    """Newton steps on u*(j w I - sum_k A_k e^{-j k theta}) v = 0, u, v the singular vectors of the least value.
+    """A crossing refined by Newton's method on u*(j w I - sum_k A_k e^{-j k theta}) v = 0.
 
-    Steps go on while they lower the least singular value. None is taken where two singular values are small (several
-    roots cross at one place) or both unknowns act alike (near-tangent): the bracketed value is better there.
+    u, v are the singular vectors of the least singular value; steps continue while they lower it. If two singular
+    values are small (roots cross together) or both unknowns act alike (near-tangent), the bracketed value is kept.
     """
     omega, theta = crossing.omega, float(np.angle(crossing.locus))
     identity = np.eye(matrices[0].shape[0])
@@ -202,12 +201,12 @@ def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing:
 
 
 def crossing_errors(terms: Sequence[DelayedTerm], places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Estimated errors of the frequency omega (rad/s) and the delay tau (s) of crossings, by their sensitivity.
+    """Estimated errors of the frequency omega (rad/s) and delay tau (s) of crossings, from their sensitivity.
 
-    `places` are their pairs (omega, tau). Let u, v be the singular vectors of the least singular value of
+    `places` are the pairs (omega, tau). Let u, v be the singular vectors of the least singular value of
     M(j omega, tau). A change E of M, of norm epsilon, moves the crossing by the solution of
     a d omega + b d tau = -u*E v with a = u*(dM/d omega) v, b = u*(dM/d tau) v: two real equations. Near a multiple root
-    a and b become small; the estimate is capped by epsilon^(1/n), which no multiplicity exceeds.
+    a and b become small; the estimate is capped by epsilon^(1/n), the error at the highest possible multiplicity.
     """
     blocks = [np.array(balanced(*block.matrices)) for block in distinct_blocks(*(term.matrix for term in terms))]
     multiples = np.array([term.multiple for term in terms])
@@ -220,7 +219,7 @@ def crossing_errors(terms: Sequence[DelayedTerm], places: Sequence[tuple[float, 
 def _error(
     blocks: Sequence[FloatArray], delays_s: FloatArray, multiples: IntArray, omega: float, tau_s: float
 ) -> tuple[float, float]:
-    """The errors of one crossing; the block whose M is the nearest to singular has it."""
+    """The errors of one crossing, attributed to the block whose M is nearest to singular."""
     worst, least = (0.0, 0.0), inf
     for matrices in blocks:
         n = matrices.shape[1]
@@ -234,7 +233,7 @@ def _error(
             continue
         least = singular / scale
         by_s = np.eye(n) + np.tensordot(delays_s, turned, axes=1)
-        # of the roots that cross together, the one that moves most
+        # of the roots that cross together, take the one that moves most
         left, _, right = np.linalg.svd(U.conj().T @ by_s @ V)
         u, v = (U @ left[:, -1]).conj(), V @ right[-1].conj()
         by_omega = 1j * complex(u @ by_s @ v)
@@ -242,7 +241,7 @@ def _error(
         epsilon = _BACKWARD * n * float(np.finfo(np.float64).eps) * scale
         determinant = abs((by_omega.conjugate() * by_tau).imag)
         if omega == 0.0:
-            # a real root passes the one at zero: the delay is a ratio of two numbers
+            # a real root passes the one at zero: its delay is a ratio of two numbers
             worst = (0.0, tau_s * epsilon / scale / max(abs(complex(u @ v)), 1e-300))
             continue
         cap = (epsilon / scale) ** (1.0 / max(n, 2))
@@ -252,13 +251,13 @@ def _error(
 
 
 def nearly_null(M: ComplexArray, scale: float) -> tuple[float, ComplexArray, ComplexArray]:
-    """The least singular value of M (n, n), and the singular vectors U, V (n, k) of those that belong together with it.
+    """The least singular value of M (n, n), and the singular vectors U, V (n, k) of it and those close to it.
 
-    In the inverse of M bordered by b and c* the last column and row are multiples of v and u* if M v = 0 and u*M = 0,
+    If M v = 0 and u*M = 0, the last column and row of the inverse of M bordered by b and c* are multiples of v and u*,
     and its norm is at least one over the second least singular value: a tenth of the time of a decomposition.
     """
     n = len(M)
-    # no symmetry of a loop makes its vectors orthogonal to this border
+    # no symmetry of a loop makes its singular vectors orthogonal to this border
     border = scale / np.sqrt(n) * np.exp(1j * np.arange(n) ** 2)
     bordered = np.block([[M, border[:, np.newaxis]], [border.conj(), np.zeros(1, np.complex128)]])
     try:

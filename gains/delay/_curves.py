@@ -11,24 +11,24 @@ import numpy as np
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.delay._loci import unit_crossings, with_extrema
 
-# angles of the grid of starting points, and angles of the other delay in the search from each
+# angles in the grid of starting points, and angles of the other delay searched at each
 _SEED_ANGLES, _SEARCH_ANGLES = 48, 160
 # a local extremum of a real part is refined when it is closer to the axis than this, relative to the norm
 _NEAR_AXIS = 0.1
-# longest and shortest step along a curve, in radians and, for the frequency, in units of the norm
+# longest and shortest step along a curve: angles in radians, frequency in units of the norm
 _STEP, _LEAST_STEP = 0.05, 1e-5
-# most steps along one curve: some hundred turns of the torus
+# limit on steps along one curve: some hundred turns around the torus
 _MOST_STEPS = 20_000
-# a curve ends where the frequency is this small relative to the norm: there the delays grow without bound
+# a curve ends where the frequency is this small relative to the norm, because delays grow without bound there
 _LOWEST = 1e-4
-# a starting point is on a known curve if it is this close (in steps) to one of its points, and this close to a segment
+# a starting point is on a known curve if it is within these distances (in steps) of one of its points and of a segment
 _ON_CURVE, _SAME_CURVE = 1.5, 0.05
 
 
 def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[FloatArray]:
     """The curves of one block that pass through the starting points of the grids.
 
-    Each is an array (k, 3) of omega in rad/s and of alpha and beta in rad, unwrapped.
+    Each is an array (k, 3) of omega in rad/s and alpha and beta in rad, the angles unwrapped.
     """
     scale = sum(float(np.linalg.norm(matrix)) for matrix in (A0, A1, A2))
     if scale == 0.0:
@@ -37,7 +37,7 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[F
     curves: list[FloatArray] = []
     # shifted away from round angles, where the curves of symmetric loops meet
     for angle in ((np.arange(_SEED_ANGLES) + 0.37) * (2.0 * pi / _SEED_ANGLES)).tolist():
-        # a grid of beta as well: a curve on which A2 plays no part has a single alpha, which no grid hits
+        # a grid of beta as well: a curve that A2 does not affect has a single alpha, which no grid hits
         swapped = [start[[0, 2, 1]] for start in _solutions_at(terms[[0, 2, 1]], angle)]
         for start in [*_solutions_at(terms, angle), *swapped]:
             if not any(_passes(curve, start) for curve in curves):
@@ -48,9 +48,9 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[F
 def at_delay(
     matrices: tuple[FloatArray, ...], point: FloatArray, *, which: int, delay_s: float, turns: int
 ) -> FloatArray | None:
-    """The solution near a point (omega, alpha, beta) at which one delay is `delay_s`; None if none is near.
+    """The solution near a point (omega, alpha, beta) at which one delay equals `delay_s`; None if none is near.
 
-    That delay is (angle + 2 pi turns) / omega; the angle is alpha if `which` is 0, beta if it is 1.
+    That delay is (angle + 2 pi turns) / omega, where the angle is alpha for `which` = 0 and beta for `which` = 1.
     """
     scale = sum(float(np.linalg.norm(matrix)) for matrix in matrices)
     terms, units = np.array(matrices) / scale, np.array([scale, 1.0, 1.0])
@@ -83,7 +83,7 @@ def _solutions_at(terms: FloatArray, alpha: float) -> list[FloatArray]:
 
 
 def _followed(terms: FloatArray, start: FloatArray) -> FloatArray:
-    """The whole curve through a point, shape (k, 3): once around if it is closed, else from end to end."""
+    """The whole curve through a point, shape (k, 3): once around if it is closed, otherwise from end to end."""
     forward, closed = _walked(terms, start, 1.0)
     if closed:
         return forward
@@ -92,7 +92,7 @@ def _followed(terms: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArray, bool]:
-    """Points from a start in one direction, and whether they return to it."""
+    """Points along the curve from a start in one direction, and whether they return to it."""
     points, step = [start], _STEP
     direction = sign * _tangent(terms, start)
     for _ in range(_MOST_STEPS):
@@ -102,7 +102,7 @@ def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArr
         moved = float(np.linalg.norm(point - points[-1]))
         # the corrector jumped, or the bend is sharper than the step can follow
         bad = moved > 1.5 * step or moved < 0.3 * step or float(tangent @ direction) < 0.9
-        # near the end of the curve at zero frequency, too, the steps get shorter
+        # steps also get shorter near the end of the curve at zero frequency
         if (bad or point[0] < _LOWEST) and step > _LEAST_STEP:
             step /= 2.0
             continue
@@ -117,10 +117,10 @@ def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArr
 
 
 def _equation(terms: FloatArray, point: FloatArray) -> tuple[complex, FloatArray]:
-    """The least singular value of the characteristic matrix M, and its real and imaginary derivatives (2, 3).
+    """The least singular value u*M v of the characteristic matrix M, and its derivatives (2, 3), real and imaginary.
 
-    With its singular vectors it is u*M v, whose derivatives by omega, alpha and beta are j u*v, j e^{-j alpha} u*A1 v
-    and j e^{-j beta} u*A2 v.
+    u and v are its singular vectors. The derivatives by omega, alpha and beta are j u*v, j e^{-j alpha} u*A1 v and
+    j e^{-j beta} u*A2 v.
     """
     omega, alpha, beta = point
     first, second = terms[1] * np.exp(-1j * alpha), terms[2] * np.exp(-1j * beta)
@@ -147,7 +147,7 @@ def _tangent(terms: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _nearest_turn(reference: FloatArray, point: FloatArray) -> FloatArray:
-    """`reference` with whole turns added to its angles so that it is next to `point`."""
+    """`reference` with whole turns added to its angles to bring it closest to `point`."""
     turns = np.round((point[1:] - reference[1:]) / (2.0 * pi))
     return reference + np.array([0.0, *(2.0 * pi * turns)])
 
@@ -157,7 +157,7 @@ def _distance(reference: FloatArray, before: FloatArray, after: FloatArray) -> f
     point = _nearest_turn(reference, after)
     along = after - before
     share = float(np.clip((point - before) @ along / max(float(along @ along), 1e-300), 0.0, 1.0))
-    # an arc of radius about one departs from its chord by an eighth of the squared step
+    # an arc of radius about one deviates from its chord by an eighth of the squared step
     sagitta = float(along @ along) / 8.0
     return max(float(np.linalg.norm(point - before - share * along)) - sagitta, 0.0)
 

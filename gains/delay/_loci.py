@@ -1,9 +1,9 @@
-"""Eigenvalue loci of a delayed loop, and the frequencies at which one of them crosses the unit circle.
+"""Eigenvalue loci of a delayed loop, and the frequencies at which they cross the unit circle.
 
 x'(t) = A0 x(t) + A1 x(t - tau) with A1 = B C of rank r has the root s = j omega at the delay tau exactly when
 e^{j omega tau} is an eigenvalue of the r x r loop G(j omega) = C (j omega I - A0)^{-1} B. The moduli of these loci do
-not depend on tau. Sorted, they are continuous functions of the frequency however the eigenvalues are numbered: between
-two frequencies at which a different number of moduli exceeds one, there is a crossing.
+not depend on tau. Sorted, they are continuous functions of the frequency however the eigenvalues are numbered, so a
+crossing lies between two frequencies at which different numbers of moduli exceed one.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,24 +20,24 @@ from gains.core.arrays import ComplexArray, FloatArray
 Loci = Callable[[FloatArray], ComplexArray]
 
 _EPS = float(np.finfo(np.float64).eps)
-# the least normal number: a matrix of zeros has no scale of its own
+# least normal number, the floor for singular values of a zero matrix, which has no scale of its own
 _LEAST = float(np.finfo(np.float64).tiny)
-# a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
+# peaks of the modulus are refined if the sampled log modulus is this close to zero: sampling lowers a peak by far less
 _NEAR_UNIT = 1.0
-# two crossings closer than this (relative) are at one place: below the error of a double eigenvalue, sqrt(eps)
+# two crossings closer together than this (relative) coincide; it is below the error of a double eigenvalue, sqrt(eps)
 _SAME_PLACE = 1e-10
-# log of the modulus of a locus at such a place
+# a locus whose log modulus is below this at such a frequency is on the unit circle
 _ON_CIRCLE = 1e-8
-# points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
+# a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60
 _DECADES = 9
-# below this share of the highest frequency a locus that moves by less than this per octave is at its limit
+# below the first share of the highest frequency, a locus that moves by less than the second per octave is at its limit
 _SLOW, _FLAT = 1e-5, 1e-2
 
 
 @dataclass(frozen=True)
 class UnitCrossing:
-    """An eigenvalue `locus` of the loop, of modulus one to rounding, at the frequency `omega`.
+    """A crossing of the unit circle: the eigenvalue `locus`, of modulus one to rounding, at the frequency `omega`.
 
     `outward` is +1 if its modulus falls through one as the frequency rises, -1 if it rises through one, and 0 if it
     touches one and returns.
@@ -54,7 +54,7 @@ class UnitCrossing:
 
 
 def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """B (n, r) and C (r, n) with B C = `matrix` to rounding, r its numerical rank, and equal norms of both."""
+    """B (n, r) and C (r, n), of equal norm, with B C = `matrix` to rounding; r is its numerical rank."""
     U, singular, Vh = np.linalg.svd(matrix)
     rank = int(np.count_nonzero(singular > matrix.shape[0] * _EPS * singular[0])) if singular[0] > 0.0 else 0
     root = np.sqrt(singular[:rank])
@@ -62,13 +62,13 @@ def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def highest_frequency(terms: Sequence[FloatArray]) -> float:
-    """Bound (rad/s) of every root on the imaginary axis, whatever the delays; terms[0] acts at once."""
+    """Bound (rad/s) on every root on the imaginary axis, whatever the delays; terms[0] acts without delay."""
     turning = float(np.linalg.norm(terms[0] - terms[0].T)) / 2.0
     return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
 
 
 def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
-    """Ascending frequencies (rad/s) up to the bound of every crossing frequency, dense around resonances."""
+    """Ascending frequencies (rad/s) up to the bound on crossing frequencies, dense around resonances."""
     highest = 1.1 * highest_frequency((A0, A1))
     grid = [highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)]
     roots = np.concatenate([np.linalg.eigvals(A0), np.linalg.eigvals(A0 + A1)])
@@ -76,13 +76,13 @@ def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
     for root in roots[roots.imag > 0.0]:
         width = max(abs(root.real), 1e-6 * abs(root.imag))
         grid.append(root.imag + width * offsets)
-    # away from the pole itself, where the resolvent does not exist
+    # offset from the pole itself, where the resolvent does not exist
     omega = np.unique(np.concatenate(grid)) * (1.0 + 1e-9)
     return omega[(omega > 0.0) & (omega <= highest)]
 
 
 def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | float = 0.0) -> Loci:
-    """The function omega (k,) -> eigenvalues (k, r) of C (j omega I - A0)^{-1} B + D."""
+    """A function from omega (k,) to the eigenvalues (k, r) of C (j omega I - A0)^{-1} B + D."""
     identity = np.eye(A0.shape[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
@@ -93,9 +93,9 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | flo
 
 
 def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0) -> ComplexArray:
-    """Among these (2n,) are all j omega with |C (j omega I - A)^{-1} B + D| = 1: eigenvalues of a Hamiltonian matrix.
+    """Eigenvalues (2n,) of a Hamiltonian matrix, among them all j omega with |C (j omega I - A)^{-1} B + D| = 1.
 
-    It is the matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
+    Imaginary eigenvalues of this matrix decide whether an H-infinity norm exceeds one.
     """
     # |D| = 1 sends one solution to infinity
     rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
@@ -106,7 +106,7 @@ def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0)
 def solved_beside_poles(matrices: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
     """X with M X = `right` for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
 
-    `right` is (n, r), or of each matrix (k, n, r).
+    `right` is (n, r), common to all matrices, or (k, n, r).
 
     A resolvent is singular to rounding on a pole and near a multiple one (for a double integrator, at frequencies below
     1e-8 of its norm). Loci are infinite or large there; eps in place of a zero singular value makes them large.
@@ -121,15 +121,15 @@ def solved_beside_poles(matrices: NDArray[Any], right: NDArray[Any]) -> NDArray[
 
 
 def log_moduli(values: ComplexArray) -> FloatArray:
-    """Natural logarithms of the moduli along the last axis, largest first; zero and infinity become large numbers."""
+    """Natural logarithms of the moduli along the last axis, largest first; those of zero and infinity are clipped."""
     return -np.sort(-_log(values), axis=-1)
 
 
 def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     """All crossings of the unit circle that change the number of moduli above one between neighbouring `points`.
 
-    The points are ascending frequencies that separate crossings of opposite direction; crossings of the same direction
-    need not be separated.
+    The points are ascending frequencies. They must separate crossings in opposite directions, but not crossings in the
+    same direction.
     """
     logs = log_moduli(loci(points))
     above = np.count_nonzero(logs > 0.0, axis=1)
@@ -147,11 +147,11 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
 
 
 def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: float) -> list[UnitCrossing]:
-    """The crossings without those that rounding makes of a locus with modulus one at zero frequency.
+    """The crossings without the artefacts of rounding at a locus with modulus one at zero frequency.
 
-    Where A0 + z A1 is singular for some |z| = 1 (z = -1 for x' = -x - x(t - tau)), a locus tends to 1/z with the
-    frequency to zero, and its modulus differs from one by less than rounding; no finite delay belongs to it. The locus
-    of a slow motion that does cross, beside fast ones, still changes with the frequency.
+    Where A0 + z A1 is singular for some |z| = 1 (z = -1 for x' = -x - x(t - tau)), a locus tends to 1/z as the
+    frequency tends to zero, and its modulus differs from one by less than rounding; no finite delay belongs to it. A
+    slow motion beside fast ones that does cross has a locus that still changes with the frequency.
     """
 
     def is_flat(crossing: UnitCrossing) -> bool:
@@ -162,9 +162,9 @@ def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: f
 
 
 def with_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
-    """The frequencies, and those of local extrema of the sorted log moduli between them that may reach zero.
+    """The frequencies, with those added at which local extrema of the sorted log moduli may reach zero.
 
-    Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
+    Extrema whose sampled log modulus is `near` or more away from zero are assumed not to reach it.
     """
     logs = log_moduli(loci(omega))
     peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
@@ -180,25 +180,25 @@ def with_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> 
 
 
 def swept_crossings(loci: Loci, omega: FloatArray) -> list[UnitCrossing]:
-    """The crossings of loci between ascending frequencies, extrema near one included, those at zero left out."""
+    """The crossings of loci between ascending frequencies, with extrema near one refined and limits at zero removed."""
     omega = with_extrema(loci, omega)
     return without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
 
 
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
-    """+1 if the modulus of this locus falls through one at omega, -1 if it rises, 0 if it does neither."""
-    # far above the accuracy of a locus, far below the distance of frequencies at which anything else happens
+    """+1 if the modulus of this locus falls through one at omega, -1 if it rises through one, 0 if it does neither."""
+    # far above the error of a locus, far below the spacing of crossing frequencies
     step = 1e-5 * omega
     before, after = (_log(row[np.argmin(np.abs(row - locus))]) for row in loci(np.array([omega - step, omega + step])))
     return 0 if before * after >= 0.0 else int(np.sign(before))
 
 
 def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list[UnitCrossing]:
-    """Crossings at the frequencies found, with the loci that cross at one frequency told apart.
+    """Crossings at the frequencies found, with the loci that cross at the same frequency told apart.
 
-    Loci of equal modulus at all frequencies (symmetric formations) change places in the sorted order from one
-    evaluation to the next, so all that cross at one place are read from one evaluation. Where the count goes up and
-    down at one place, by rounding or because loci cross in opposite directions, each locus is followed on its own.
+    Loci of equal modulus at all frequencies (symmetric formations) swap places in the sorted order from one evaluation
+    to the next, so all that cross at one frequency are read from one evaluation. Where the count goes up and down at
+    one frequency, by rounding or because loci cross in opposite directions, each locus is followed on its own.
     """
     order = np.argsort(omega, kind="stable")
     omega, outward = omega[order], outward[order]
@@ -217,5 +217,5 @@ def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list
 
 
 def _log(values: ComplexArray) -> FloatArray:
-    """Natural logarithms of the moduli, zero and infinity as large numbers."""
+    """Natural logarithms of the moduli, clipped for zero and infinity."""
     return np.log(np.clip(np.abs(values), 1e-300, 1e300))

@@ -1,9 +1,9 @@
-"""Crossings of the imaginary axis of large blocks: the eigenvalues of A(theta) followed along the unit circle.
+"""Crossings of the imaginary axis of large blocks, by tracking the eigenvalues of A(theta) along the unit circle.
 
-For A(theta) = sum_k A_k e^{-j k theta} of more than two dozen states, an eigenvalue problem is costly. The eigenvalues
-and their first two derivatives at few angles tell each branch between them (a quintic), and how far it may be from
-that; angles are added only where a branch may reach the axis unseen. Newton's method on a bordered matrix, which takes
-factorisations only, then finds each crossing.
+For A(theta) = sum_k A_k e^{-j k theta} with more than two dozen states, an eigenvalue problem is costly. A quintic
+through the eigenvalues and their first two derivatives at a few angles approximates each branch between them, with an
+error bound; angles are added only where a branch may reach the axis unseen. Newton's method on a bordered matrix, which
+needs only factorisations, then finds each crossing.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,33 +16,33 @@ import numpy as np
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.delay._crossings import Crossing
 
-# intervals for each multiple of the delay on the upper half of the circle, which they exceed a little on both sides
+# intervals per multiple of the delay on the upper half of the circle, and how far (rad) they extend past both its ends
 _INTERVALS, _BEYOND = 8, 0.02
-# they are halved down to this width (rad); a branch that is still unclear there touches the axis
+# intervals are halved down to this width (rad); a branch that is still unclear then touches the axis
 _NARROWEST = 1e-7
-# places in an interval, 0 to 1, at which branches are looked at
+# points in an interval, from 0 to 1, at which branches are evaluated
 _PLACES = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
 _FREE = (_PLACES * (1.0 - _PLACES)) ** 2
-# error of a quintic in units of its difference from the cubic: that of a branch with a kink amid the interval, which is
-# what two eigenvalues that avoid each other make
+# error of a quintic in units of its difference from the cubic: that of a branch with a kink inside the interval, as
+# made by two eigenvalues that avoid each other
 _KINK = 3.0
 # above the largest slope of t^2 (1 - t)^2, 0.19: an error may have that slope in units of its bound
 _STEEP = 0.2
-# relative to the norm: eigenvalues that differ by less are equal, an eigenvalue is known to less, one on the axis
+# relative to the norm: difference of equal eigenvalues, error of an eigenvalue, real part of one on the axis
 _EQUAL, _KNOWN, _ON_AXIS = 1e-12, 1e-9, 1e-11
-# two branches that lead to one crossing but are this far apart (relative to the norm) have another one each
+# two branches that converge to one crossing but are this far apart (relative to the norm) have separate crossings
 _APART = 1e-7
-# a crossing lies in its interval up to this share of the width
+# a crossing may lie outside its interval by this share of the width
 _OUTSIDE = 0.05
-# steps of Newton's method (rad, relative to the norm): at most so many, until the next would be below this, or with
-# rounding the last one below that
+# Newton's method (steps in rad, relative to the norm): most steps; size of the next step at which it is done; size of
+# the last step that is accepted if rounding keeps steps from shrinking
 _NEWTON_STEPS, _DONE, _DONE_BY_ROUNDING = 12, 1e-15, 1e-10
-# rad; an angle this close to 0 or pi is there, and one this close to 0 is 0
+# rad; an angle within the first of 0 or pi is taken to be there, one within the second of 0 is set to 0
 _SAME, _ZERO_ANGLE = 1e-9, 1e-11
 
 
 class UnclearError(Exception):
-    """Branches cannot be told apart, for example because eigenvalues coincide at all angles."""
+    """Branches cannot be told apart, for example where eigenvalues coincide at all angles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class _Sample:
     slopes: ComplexArray
     bends: ComplexArray
     vectors: ComplexArray
-    """(n, n), one in a column."""
+    """Right eigenvectors (n, n), one per column."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ def tracked_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
 
 
 def _sample(terms: ComplexArray, theta: float, scale: float) -> _Sample:
-    """With V^{-1} A V = diag(s), W = V^{-1} A' V and X = V^{-1} A'' V the derivatives of s_i are W_ii and
+    """With V^{-1} A V = diag(s), W = V^{-1} A' V and X = V^{-1} A'' V, the derivatives of s_i are W_ii and
     X_ii + 2 sum_j W_ij W_ji / (s_i - s_j).
     """
     roots, right = np.linalg.eig(at_angle(terms, theta))
@@ -113,7 +113,7 @@ def at_angle(terms: Sequence[FloatArray] | ComplexArray, theta: FloatArray | flo
 
 
 def _between(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -> Iterator[_Found]:
-    """Crossings between two angles, which are halved until each branch is clear."""
+    """Crossings between two angles; the interval is halved until every branch is clear."""
     found = _of_branches(terms, left, right, scale)
     if found is not None:
         yield found
@@ -126,17 +126,17 @@ def _between(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -
 
 
 def _of_branches(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -> _Found | None:
-    """Crossings of all branches in an interval; None if it is too wide to tell."""
+    """Crossings of all branches in an interval; None if the interval is too wide to decide."""
     width = right.theta - left.theta
     partner = _partners(left.roots + width / 2.0 * left.slopes, right.roots - width / 2.0 * right.slopes)
     quintics, bound = _quintics(left, right, partner)
     real = _values(quintics, _PLACES).real
-    # a branch may turn between two places, by up to an eighth of its second difference
+    # a branch may turn back between two points, by up to an eighth of its second difference
     turn = np.abs(np.diff(real, 2, axis=0)).max(axis=0) / 8.0
     positive, sure = real > 0.0, np.abs(real) > bound * _FREE + turn
-    # at the ends the eigenvalues are known
+    # eigenvalues are known at the ends
     sure[[0, -1]] = True
-    # the sign at the nearest sure place before and after each place
+    # the sign at the nearest sure point before and after each point
     order = np.arange(len(real))[:, np.newaxis]
     last = np.maximum.accumulate(np.where(sure, order, 0), axis=0)
     following = np.minimum.accumulate(np.where(sure, order, len(real) - 1)[::-1], axis=0)[::-1]
@@ -144,11 +144,11 @@ def _of_branches(terms: ComplexArray, left: _Sample, right: _Sample, scale: floa
     flips = positive[1:] != positive[:-1]
     touches = np.any(~sure & (before == after), axis=0)
     unclear = flips.sum(axis=0) != np.count_nonzero(before[1:] != before[:-1], axis=0)
-    # a branch that is not steep where it passes may pass three times
+    # a branch that is not steep where it crosses may cross three times
     steep = np.abs(np.gradient(real, _PLACES[:, 0], axis=0)) > _STEEP * bound
     unclear |= flips.any(axis=0) & np.any(~sure & ~steep, axis=0)
     if width < 2.0 * _NARROWEST:
-        # closer to the axis than rounding tells: it touches, if it is on it at all
+        # closer to the axis than rounding can resolve: a touch, if the branch is on the axis at all
         unclear &= ~touches
         flips[:, touches] = False
         touches &= np.abs(real).min(axis=0) < _ON_AXIS * scale
@@ -175,7 +175,7 @@ def _of_branches(terms: ComplexArray, left: _Sample, right: _Sample, scale: floa
 
 
 def _partners(ahead: ComplexArray, back: ComplexArray) -> IntArray:
-    """For each of the eigenvalues `ahead` its own one `back`: again and again the two nearest to each other."""
+    """Index of the partner in `back` of each eigenvalue in `ahead`, by repeatedly pairing mutual nearest neighbours."""
     apart = np.abs(ahead[:, np.newaxis] - back)
     apart = np.where(np.isfinite(apart), apart, np.finfo(np.float64).max)
     partner = np.full(len(apart), -1)
@@ -188,18 +188,18 @@ def _partners(ahead: ComplexArray, back: ComplexArray) -> IntArray:
 
 
 def _quintics(left: _Sample, right: _Sample, partner: IntArray) -> tuple[ComplexArray, FloatArray]:
-    """The quintics (6, n) on [0, 1] with these values and derivatives at its ends, and the bounds of their errors.
+    """The quintics (6, n) on [0, 1] with these values and derivatives at the ends, and the bounds (n,) of their errors.
 
-    An error is below its bound (n,) times t^2 (1 - t)^2.
+    The error is below the bound times t^2 (1 - t)^2.
     """
     width = right.theta - left.theta
     begin, start, finish = left.roots, width * left.slopes, width * right.slopes[partner]
     rise = right.roots[partner] - begin
-    # of the cubic with these values and slopes, and what its second derivatives lack at the ends
+    # coefficients of the cubic with these values and slopes, and half the errors of its second derivatives at the ends
     square, cube = 3.0 * rise - 2.0 * start - finish, start + finish - 2.0 * rise
     at_left = (width**2 * left.bends - 2.0 * square) / 2.0
     at_right = (width**2 * right.bends[partner] - 2.0 * square - 6.0 * cube) / 2.0
-    # t^2 (1 - t)^2 (at_left (1 - t) + at_right t) beside the cubic
+    # t^2 (1 - t)^2 (at_left (1 - t) + at_right t), added to the cubic
     extra = [at_left, at_right - 3.0 * at_left, 3.0 * at_left - 2.0 * at_right, at_right - at_left]
     quintics = np.array([begin, start, square + extra[0], cube + extra[1], *extra[2:]])
     return quintics, _KINK * np.maximum(np.abs(at_left), np.abs(at_right))
@@ -215,7 +215,7 @@ def _values(quintics: ComplexArray, t: FloatArray) -> ComplexArray:
 def _belong(
     found: _Found, quintics: ComplexArray, bound: FloatArray, at: FloatArray, begin: float, width: float, scale: float
 ) -> bool:
-    """Whether each crossing is in the interval and on its branch, and no two branches lead to one crossing."""
+    """Whether each crossing is in the interval and on its branch, and no two branches converge to one crossing."""
     t = (found.theta - begin) / width
     predicted = _values(quintics, t)
     near = np.abs(predicted - 1j * found.omega) <= bound / 16.0 + _KNOWN * scale
@@ -227,10 +227,10 @@ def _belong(
 
 
 def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: ComplexArray, scale: float) -> _Found | None:
-    """The crossings near these (k,) and near their vectors v (k, n), by Newton's method; None unless all are found.
+    """The crossings near theta, omega (k,) and vectors v (k, n), by Newton's method; None unless all converge.
 
     It solves M v = 0, c*v = 1 for v, omega and theta, M = j omega I - A(theta). With omega taken as complex, one
-    factorisation gives its step a + b d(theta), and d(theta) leaves it real. At the crossing ds/d(theta) = j b.
+    factorisation gives its step a + b d(theta); d(theta) keeps omega real. At the crossing ds/d(theta) = j b.
     """
     n = v.shape[1]
     v = v / np.linalg.norm(v, axis=1, keepdims=True)
@@ -254,8 +254,8 @@ def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: Comple
             v = v + step[:, :n, 0] + by_theta[:, np.newaxis] * step[:, :n, 1]
         theta, omega = theta + by_theta, omega + by_omega
         size, before = float(np.maximum(np.abs(by_omega) / scale, np.abs(by_theta)).max(initial=0.0)), size
-        # the next step is to this one as the square of this one is to that of the last
+        # quadratic convergence: the next step is to this one as the square of this one is to that of the last
         if size <= _KNOWN and size**3 <= _DONE * before**2:
             return _Found(theta, omega, -np.sign(b.imag).astype(np.intp))
-    # rounding may keep the last steps from shrinking further
+    # rounding may keep the last steps from shrinking
     return _Found(theta, omega, -np.sign(b.imag).astype(np.intp)) if size <= _DONE_BY_ROUNDING else None

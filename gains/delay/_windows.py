@@ -1,7 +1,7 @@
-"""From the crossings of the imaginary axis to windows of stability.
+"""Stability windows from the crossings of the imaginary axis.
 
 Every crossing belongs to an arithmetic sequence of delays, (theta + 2 pi k) / omega. The count of unstable roots starts
-at that without delay and changes at each crossing, in the order of the delays; where it is zero, the loop is stable.
+at its value without delay and changes at each crossing, in order of delay; the loop is stable where it is zero.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from gains.core.errors import DisagreementError
 from gains.core.structure import is_singular_for_any_delay
 from gains.delay._crossings import Crossing, DelayedTerm, crossing_errors
 
-# more critical delays than this are not listed: a near-tangent pair of crossings can have millions
+# at most this many critical delays are listed: a near-tangent pair of crossings can have millions
 _MOST_EVENTS = 200_000
-# two critical delays closer than this (relative) are one
+# two critical delays closer together than this (relative) are the same
 _SAME_DELAY = 1e-12
-# windows or gaps narrower than this (relative) are computed again, with the errors of the critical delays
+# if a window or gap is narrower than this (relative), the errors of the critical delays are taken into account
 _NARROW = 1e-2
-# the least cosine of the angle between the null vectors of a simple eigenvalue; rounding is far below
+# the null vectors of a simple eigenvalue have at least this cosine between them; rounding is far below
 _SIMPLE = 1e-6
-# a crossing below this share of the highest frequency, and this close to the limit (rad), is the root at zero
+# a crossing below this share of the highest frequency, and within this angle (rad) of its limit, is the root at zero
 _BLUR, _TURN = 1e-3, 1e-3
 
 
@@ -33,7 +33,7 @@ class DelayAnalysis:
     """Verdict on x'(t) = A0 x(t) + A1 x(t - tau) for every constant delay tau >= 0."""
 
     stable_intervals_s: tuple[tuple[float, float], ...]
-    """The open windows of asymptotic stability, `inf` for one without end. A window that begins at 0 includes zero
+    """The open windows of asymptotic stability; an unbounded one ends at `inf`. A window that begins at 0 includes zero
     delay itself, unless A0 + A1 has roots on the imaginary axis that move to the left as the delay grows."""
     delay_margin_s: float
     """The end of the window that begins at 0, or 0 if none does."""
@@ -44,23 +44,23 @@ class DelayAnalysis:
     unstable_roots_at_zero_delay: int
     """The number of eigenvalues of A0 + A1 with positive real part."""
     complete_to_s: float
-    """The delay up to which all windows are listed: `inf` unless the caller gave a horizon or there are too many
+    """The delay up to which the windows are complete: `inf` unless the caller gave a horizon or there are too many
     critical delays to list. The margin is exact in either case."""
     roots_fixed_at_zero: int = 0
     """The number of roots at s = 0 that were left out at the caller's request."""
 
     def window_around(self, delay_s: float) -> tuple[float, float] | None:
-        """The window of stability in which a delay is; None if there is none."""
+        """The stability window that contains a delay; None if the loop is not stable there."""
         windows = self.stable_intervals_s
         return next((w for w in windows if w[0] < delay_s < w[1] or w[0] == delay_s == 0.0), None)
 
 
 @dataclass(frozen=True)
 class ZeroPassage:
-    """A real root passes the root that stays at s = 0 at `delay_s`: to the right, unstable (+1), or to the left (-1).
+    """Passage of a real root, at `delay_s`, by the root that stays at s = 0: to the right (+1, unstable) or left (-1).
 
-    `direction` is 0 if none passes at a positive delay; `delay_s` is then negative or infinite. All multiples of tau
-    are multiples of `unit`.
+    `direction` is 0 if no root passes at a positive delay; `delay_s` is then infinite or not positive. All multiples of
+    tau are multiples of `unit`.
     """
 
     delay_s: float
@@ -68,7 +68,7 @@ class ZeroPassage:
     unit: int = 1
 
     def is_seen_as(self, crossing: Crossing, highest: float) -> bool:
-        """Whether a crossing is the root at zero, blurred by rounding.
+        """Whether a crossing is an artefact of rounding at the root that stays at zero.
 
         The locus of that root has modulus one to rounding at low frequencies, so its noise may cross one many times,
         at each angle of tau that is a whole turn of `unit` tau.
@@ -80,7 +80,7 @@ class ZeroPassage:
 
 @dataclass(frozen=True)
 class BlockAnalysis:
-    """The analysis of one block that stands for `copies` equal ones; `roots` of its crossings counts one copy.
+    """The analysis of one block that stands for `copies` equal ones; `roots` in its crossings counts one copy.
 
     `fixed_at_zero`: a simple root at s = 0 was left out. `fixed_on_axis`: a root stays on the imaginary axis at every
     delay and was not left out.
@@ -95,7 +95,7 @@ class BlockAnalysis:
 
 
 def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) -> DelayAnalysis:
-    """The analysis of a loop from those of its blocks."""
+    """The analysis of a loop, combined from those of its blocks."""
     crossings = [
         replace(crossing, roots=crossing.roots * block.copies) for block in blocks for crossing in block.crossings
     ]
@@ -118,7 +118,7 @@ def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) 
 def _windows(
     blocks: Sequence[BlockAnalysis], crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
 ) -> tuple[tuple[tuple[float, float], ...], float]:
-    """`stability_windows`, with the errors of the critical delays where these are too close to be told apart.
+    """`stability_windows`, allowing for the errors of critical delays that are too close together to order reliably.
 
     A multiple root is computed as several that cross near each other, perhaps in the wrong order.
     """
@@ -128,7 +128,7 @@ def _windows(
         if all(after_s == inf or after_s - before_s > _NARROW * after_s for before_s, after_s in pairwise(edges_s)):
             return found
     except DisagreementError:
-        # more roots come out than went in: perhaps the order is wrong
+        # more roots leave the right half plane than are in it: perhaps the order is wrong
         pass
     errors: dict[tuple[float, float], tuple[float, float]] = {}
     for block in blocks:
@@ -141,9 +141,9 @@ def _windows(
 def block_analysis(
     copies: int, terms: Sequence[DelayedTerm], found: Sequence[Crossing], unstable: int, passage: ZeroPassage | None
 ) -> BlockAnalysis:
-    """One block's analysis from its crossings, without those seen of `passage`, and its unstable roots without delay.
+    """One block's analysis from its crossings and its number of unstable roots without delay.
 
-    `passage` is what `zero_passage` says of a root at zero that is left out, None if there is none.
+    `passage` is the result of `zero_passage` for a root at zero that is left out, None if there is none.
     """
     crossings = list(found)
     if passage is not None and passage.direction != 0:
@@ -152,13 +152,13 @@ def block_analysis(
 
 
 def without_zero(found: Sequence[Crossing], passage: ZeroPassage | None, highest: float) -> list[Crossing]:
-    """The crossings up to the frequency `highest` that are not a root at zero, blurred by rounding."""
+    """The crossings without those that rounding makes of a root at zero; `highest` bounds their frequencies."""
     return [crossing for crossing in found if passage is None or not passage.is_seen_as(crossing, highest)]
 
 
 def unstable_roots(roots: ComplexArray, found: Sequence[Crossing], passage: ZeroPassage | None) -> int:
-    """The number of roots without delay right of the axis, without those that are known to be on it."""
-    # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
+    """The number of roots right of the axis without delay, excluding those known to be on it."""
+    # a pair that crosses at zero delay is on the axis: rounding must not put it in either half plane
     for crossing in found:
         if crossing.delay_s == 0.0:
             for sign in (1.0, -1.0):
@@ -173,8 +173,8 @@ def stability_windows(
 ) -> tuple[tuple[tuple[float, float], ...], float]:
     """The windows without unstable roots, and the delay up to which they are complete.
 
-    `errors` are those of each crossing's frequency (rad/s) and delay (s). If given, a gap between two critical delays
-    that their errors can explain is not a window.
+    `errors` are those of each crossing's frequency (rad/s) and delay (s). If they are given, a gap between two critical
+    delays within their errors is not a window.
     """
     if not crossings:
         return (((0.0, inf),) if unstable == 0 else ()), inf
@@ -183,12 +183,12 @@ def stability_windows(
     change = np.array([crossing.direction * crossing.roots for crossing in crossings])
     # a real root passes zero once only
     period_s = np.divide(2.0 * pi, omega, out=np.full(omega.size, inf), where=omega > 0.0)
-    # of the roots on the axis at zero delay, those that leave it to the right are unstable from there on
+    # roots on the axis at zero delay that leave it to the right are unstable from there on
     at_zero = first == 0.0
     unstable += int(change[at_zero & (change > 0)].sum())
     first = np.where(at_zero, period_s, first)
     wanted_s, complete_to_s = _last_delay(omega, first, change, unstable, horizon_s)
-    # a window that begins by then ends at a root that comes in, within one period of the fastest sequence that does
+    # a window that begins by then ends when a root enters, within one period of the fastest entering sequence
     entering = change >= 0 if bool(np.any(change >= 0)) else np.full(change.size, True)
     returns_s = np.where(period_s < inf, np.maximum(first, wanted_s + period_s), np.where(first < wanted_s, inf, first))
     last_s = min(float(returns_s[entering].min()), max(float(first.max()), wanted_s + float(period_s.min())))
@@ -204,7 +204,7 @@ def stability_windows(
     wide = np.diff(delays) > _SAME_DELAY * delays[:-1]
     if errors:
         by_omega, by_delay = np.array(errors).T
-        # an error of the frequency counts once more with every turn
+        # an error of the frequency counts once for every turn
         blur = (by_delay[source] + 2.0 * pi * k / np.maximum(omega[source], 1e-300) ** 2 * by_omega[source])[order]
         wide &= np.diff(delays) > np.maximum(np.append(0.0, blur), np.append(blur, 0.0))
     known = delays[:-1] <= wanted_s
@@ -222,8 +222,8 @@ def _last_delay(
 ) -> tuple[float, float]:
     """The last delay (s) at which a listed window may begin, and the delay up to which the list is complete.
 
-    A sequence has at least (tau - first) omega / 2 pi members up to tau, and at most one more. The count of unstable
-    roots therefore has a lower bound that grows linearly with tau; no window lies where that bound exceeds zero.
+    A sequence has between (tau - first) omega / 2 pi and one more members up to tau. The count of unstable roots
+    therefore has a lower bound that is linear in tau; no window lies where that bound exceeds zero.
     """
     growth = float((change * omega).sum()) / (2.0 * pi)
     offset = unstable - float((change * omega * first).sum()) / (2.0 * pi) + float(change[change < 0].sum())
@@ -240,10 +240,10 @@ def _last_delay(
 def zero_passage(
     matrices: Sequence[FloatArray] | FloatArray, known_s: FloatArray, multiples: IntArray
 ) -> ZeroPassage | None:
-    """The root that passes the simple root of a block at s = 0; None unless s = 0 is a simple root at every delay.
+    """The root that passes a block's root at s = 0; None unless s = 0 is a simple root at every delay.
 
-    A_k of `matrices`, (n, n) in 1/s, acts d_k = known_s[k] + multiples[k] tau late. With w'M(0) = 0 and M(0) v = 0 for
-    M(s) = sI - sum_k A_k e^{-s d_k}, the other roots near zero solve
+    Matrix A_k of `matrices`, (n, n) in 1/s, acts with the delay d_k = known_s[k] + multiples[k] tau. With w'M(0) = 0
+    and M(0) v = 0 for M(s) = sI - sum_k A_k e^{-s d_k}, the other roots near zero solve
 
         w'M'v + s w'(M''/2 - M' G M') v + ... = 0,   M' = I + sum_k d_k A_k,  M'' = -sum_k d_k^2 A_k,
 
@@ -263,7 +263,7 @@ def zero_passage(
 
     slope_known = w @ v + w @ weight(known_s) @ v
     by_delay = float(w @ weight(multiples) @ v)
-    # simple without delay at all, and with the known ones: two roots that stay are beyond this
+    # the root must be simple both without delay and with the known delays; two roots that stay are not handled
     if min(abs(float(w @ v)), abs(float(slope_known))) < _SIMPLE:
         return None
     unit = gcd(*multiples[terms.any(axis=(1, 2))].tolist()) or 1

@@ -1,10 +1,10 @@
-"""How much constant delay a linear loop x'(t) = A0 x(t) + A1 x(t - tau) tolerates: exact, without a grid.
+"""Exact delay margin and stability windows of a linear loop x'(t) = A0 x(t) + A1 x(t - tau), without a grid.
 
 The roots of det(sI - A0 - A1 e^{-s tau}) move continuously with tau and change half plane only through the imaginary
-axis. The crossings are found in `_crossings` and counted in `_windows`; strongly connected blocks are analysed one by
-one, see `gains.core.structure`. One delay is the least case of `_commensurate`, which has the delays tau, 2 tau, ...
+axis. `_crossings` finds the crossings, `_windows` counts them; strongly connected blocks are analysed one by one, see
+`gains.core.structure`. A single delay is the simplest case of `_commensurate`, which handles tau, 2 tau, ...
 
-Methods of this kind are set side by side in E. Jarlebring and M. E. Hochstenbach, "Polynomial two-parameter eigenvalue
+Methods of this kind are compared in E. Jarlebring and M. E. Hochstenbach, "Polynomial two-parameter eigenvalue
 problems and matrix pencil methods for stability of delay-differential equations", arXiv:0809.3634.
 """
 
@@ -24,12 +24,12 @@ def analyse_delay(
 ) -> DelayAnalysis:
     """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau) + A2 x(t - 2 tau) + ...
 
-    A0, A1 and the `further` A2, A3, ... are real matrices (n, n) in 1/s. All windows are listed, of which there are
-    finitely many, or with `horizon_s` only those that begin before this delay.
+    A0, A1 and the `further` A2, A3, ... are real matrices (n, n) in 1/s. All windows are listed (there are finitely
+    many), or with `horizon_s` only those that begin before this delay.
 
-    A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
-    margin 0. One is s = 0 if the sum of the matrices is singular. If that root is merely the common value of a
-    consensus, ask for `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove
+    A loop with a root that stays on the imaginary axis at every delay is never asymptotically stable: no window,
+    margin 0. If the sum of the matrices is singular, s = 0 is such a root. If it is merely the common value of a
+    consensus, set `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove the
     states on which nothing acts with `gains.core.structure.without_equilibria`.
 
     Raises BadModelError unless the matrices are square, finite, of one size and not too many, and the horizon positive;
@@ -50,7 +50,7 @@ def analyse_delay(
 def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """The least delay (s) at which x'(t) = A0 x(t) + A1 x(t - tau) loses stability.
 
-    `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as of `analyse_delay`.
+    `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as for `analyse_delay`.
 
     >>> round(delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796

@@ -1,4 +1,4 @@
-"""Rightmost root of a linear system with any number of constant delays: the spectrum at given delays.
+"""Rightmost characteristic roots of a linear system with any number of constant delays.
 
 x'(t) = sum_k A_k x(t - tau_k) is u' = D u on functions over [-tau_max, 0]. On Chebyshev points D is a matrix whose
 eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact.
@@ -17,22 +17,22 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, square_matrices
 
-# enough for a starting value of Newton's method: 12 points, and one more for every two radians of |s| tau
+# enough to start Newton's method: 12 points, and one more for every two radians of |s| tau
 _POINTS = 12
 # larger discretisations take tens of seconds
 _LARGEST_MATRIX = 1500
-# roots of two discretisations are one this close together, relative
+# roots of two discretisations this close together (relative) are the same root
 _SAME = 1e-6
 
 
 def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     """The root of det(sI - sum_k A_k e^{-s tau_k}) with the largest real part (1/s), imaginary part >= 0.
 
-    `terms` are pairs (A_k, tau_k): a real matrix (n, n) in 1/s and its delay in s, zero for what acts at once. Raises
-    BadModelError if there is none, the matrices are not square, finite and of one size, a delay is negative or not
-    finite, or delays are so long against the time constants that the discretisation would be too large.
+    `terms` are pairs (A_k, tau_k): a real matrix (n, n) in 1/s and its delay in s, zero for a term without delay.
+    Raises BadModelError if `terms` is empty, the matrices are not square, finite and of one size, a delay is negative
+    or not finite, or delays exceed the time constants so far that the discretisation would be too large.
 
-    At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
+    x'(t) = -x(t - tau) has the root W(-1), Lambert's function, at tau = 1 and the roots +-j at tau = pi / 2:
 
     >>> from math import pi
     >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
@@ -45,9 +45,9 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
 def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
     """The `count` rightmost roots (1/s) with imaginary part >= 0, from right to left; fewer if there are fewer.
 
-    Equation, arguments and exceptions as of `rightmost_root`. A root that equal loops in the matrices share comes once.
+    Equation, arguments and exceptions as for `rightmost_root`. A root shared by equal blocks is listed once.
 
-    Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
+    The roots of x'(t) = -x(t - 1) are the branches of Lambert's W(-1):
 
     >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
     [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
@@ -76,7 +76,7 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
     approximations = _pseudospectral_roots(matrices, delays, count - 1)
     upper = approximations[approximations.imag >= 0.0]
     upper = upper[np.argsort(-upper.real)]
-    # the rightmost approximation need not belong to the rightmost root: all within its error band are refined
+    # the rightmost approximation need not belong to the rightmost root, so all within its error band are refined
     band = _band(delays, upper[0])
     near = int(np.count_nonzero(upper.real > upper[0].real - band))
     tried = upper[: min(near, 12) if count == 1 else 2 * count + 12].tolist()
@@ -84,15 +84,15 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
     rightmost = max(found, key=lambda root: root.real)
     if not (rightmost.real > upper[0].real - band and _is_root(matrices, delays, rightmost)):
         return _roots_among_others(matrices, delays, count)
-    # approximations farther left may be of no root at all, or several of one
+    # farther left, approximations may be spurious, or several may belong to one root
     return found if count == 1 else _apart(matrices, delays, found)
 
 
 def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) -> list[complex]:
-    """The same where the rightmost approximation is of no root, as where what is late is weak: on ever more points.
+    """Roots of a block whose rightmost approximation is spurious (its delayed terms are weak), on ever finer grids.
 
-    A root right of one at r turns no faster than by the sum of |A_k| e^{-r tau_k}, which the points must resolve. Where
-    terms cancel, that is far too fast: two further looks that find no other root are enough.
+    Roots right of one at r oscillate no faster than the sum of |A_k| e^{-r tau_k}, which the points must resolve. Where
+    terms cancel, this bound is far too high: two finer grids that find the same rightmost root are enough.
     """
     rightmost: list[complex] = []
     while True:
@@ -114,7 +114,7 @@ def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) ->
 
 
 def _band(delays: FloatArray, s: complex) -> float:
-    """How far left of its root an approximation may be."""
+    """Error band: how far left of its root an approximation may lie."""
     return 0.05 * (abs(s) + 1.0 / float(delays.max()))
 
 
@@ -123,7 +123,7 @@ def _is_root(matrices: FloatArray, delays: FloatArray, s: complex) -> bool:
 
 
 def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -> list[complex]:
-    """The numbers that are roots, each once."""
+    """Those of the numbers found that are roots, without duplicates."""
     kept: list[complex] = []
     for s in found:
         terms = np.exp(-s * delays)[:, np.newaxis, np.newaxis] * matrices
@@ -135,18 +135,18 @@ def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -
 
 
 def _turning(matrices: FloatArray, weights: FloatArray) -> float:
-    """A bound of |Im s| of roots right of a line on which |e^{-s tau_k}| are the `weights`."""
+    """Bound on |Im s| of the roots right of a vertical line on which |e^{-s tau_k}| equals `weights`."""
     turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
     return turning + float((np.linalg.norm(matrices[1:], 2, axis=(1, 2)) * weights[1:]).sum())
 
 
 def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0) -> ComplexArray:
-    """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate.
+    """Eigenvalues of the discretised generator; block row 0 is the equation, the other rows differentiate.
 
-    Each of the `further` chains of roots on the left turns once more over the longest delay.
+    Each of the `further` roots to the left makes one more turn over the longest delay and takes four more points.
     """
     n, longest = matrices.shape[1], float(delays.max())
-    # of roots near or right of the axis
+    # bound for roots near or right of the axis
     highest = _turning(matrices, np.ones(len(delays)))
     points = finer * (_POINTS + highest * longest / 2.0 + 4.0 * further)
     if not n * (points + 1.0) <= _LARGEST_MATRIX:
@@ -187,10 +187,10 @@ def _lagrange_row(nodes: FloatArray, at: float) -> FloatArray:
 
 
 def _newton(matrices: FloatArray, delays: FloatArray, root: complex) -> complex:
-    """Newton steps on u*M(s)v = 0 with the singular vectors of the least singular value of M(s); the best iterate.
+    """Best iterate of Newton's method on u*M(s)v = 0, u and v the singular vectors of the least singular value of M(s).
 
-    Of a complex pair it is the root with positive imaginary part.
-    An iteration that runs away from its start (a multiple root, or a spurious approximation) ends there.
+    Its imaginary part is made >= 0. The iteration stops if it runs away from its start, as it does from a multiple root
+    or a spurious approximation.
     """
     identity = np.eye(matrices.shape[1])
     best, best_value, s = root, np.inf, root

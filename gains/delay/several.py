@@ -1,14 +1,13 @@
-"""Several independent delays, one for each link: the combinations at which the loop is stable.
+"""Stability of a loop with several independent delays, one for each link.
 
 x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
 A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. `_curves` follows the solutions (omega, alpha, beta).
-Each belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: curves in the plane of
-delays across which the number of unstable roots changes. The edge of the stable region is made of their pieces on
-which no root lies right of the axis. If each block has one delay only, as in a leader-follower tree with a delay for
-each vehicle, the region is a rectangle (`delay_box`).
+Each maps to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega) for whole p and q, which form curves in the
+plane of delays. The number of unstable roots changes across them; the edge of the stable region consists of the pieces
+on which no root lies right of the axis. If each block has only one delay, as in a leader-follower tree with one delay
+for each vehicle, the region is a rectangle (`delay_box`).
 
-See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, which parameterises the
-same curves.
+E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, parameterises the same curves.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,13 +26,13 @@ from gains.delay.rightmost import rightmost_root
 
 # a rightmost root is on the axis if it is this close to it, relative to its own size
 _ON_AXIS = 1e-6
-# pieces of a crossing curve with fewer points only touch a corner of the box
+# a piece of a crossing curve with fewer points merely touches a corner of the box
 _LEAST_POINTS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """Delays (tau_1, tau_2) `delays_s` (k, 2) with roots +-j `omega_rad_s` (k,) on the imaginary axis."""
+    """Curve of delays (tau_1, tau_2), `delays_s` (k, 2), with roots +-j `omega_rad_s` (k,) on the imaginary axis."""
 
     delays_s: FloatArray
     omega_rad_s: FloatArray
@@ -43,10 +42,10 @@ class Polyline:
 class DelayBox:
     """The delays tau_1, ..., tau_m that the loop tolerates independently of each other.
 
-    `limits_s` holds, for each delay, the limit set by the blocks in which it is the only one: `inf` for no limit, and
-    all zero if a block is unstable without delay. `coupled` lists the sets of delays (by index) that meet in one block,
-    where the limit of one depends on the others. If it is empty, the box is exact: the loop is stable at every delay
-    inside, and loses stability on its faces.
+    `limits_s` holds, for each delay, the limit set by the blocks in which no other delay acts: `inf` for no limit, all
+    zero if a block is unstable without delay. `coupled` lists the sets of delays (by index) that act in one block,
+    where the limit of each depends on the others. If it is empty, the box is exact: the loop is stable at all delays
+    inside and loses stability on its faces.
     """
 
     limits_s: tuple[float, ...]
@@ -54,7 +53,7 @@ class DelayBox:
 
     @property
     def is_exact(self) -> bool:
-        """Whether no limit depends on another delay."""
+        """Whether every limit is independent of the other delays."""
         return not self.coupled
 
 
@@ -62,10 +61,10 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) tolerates, block by block.
 
     Couplings between strongly connected blocks do not matter: in a leader-follower tree with one delay for each vehicle
-    every block has one delay, and the box is exact. A0 acts at once and late[k] tau_k late, real matrices (n, n) in
-    1/s; BadModelError unless they are square, finite and of one size.
+    every block has one delay, and the box is exact. A0 acts without delay and late[k] with tau_k; all are real matrices
+    (n, n) in 1/s. BadModelError unless they are square, finite and of one size.
 
-    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay is.
+    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2) is stable up to pi / 2 and pi / 4, whatever the other delay:
 
     >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
     >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
@@ -87,12 +86,12 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
 
 def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
-    """The part of B K that comes from each vehicle's command, one matrix (n, n) for each: a delayed term of its own.
+    """Split B K into one matrix (n, n) for each vehicle's command, so that each can have a delay of its own.
 
-    B is (n, p), K is (p, n), u = K x, and `inputs` has the place of each vehicle's command in u, as
+    B is (n, p), K is (p, n), u = K x. `inputs` holds the slice of u with each vehicle's command, as given by
     `gains.formation.model.FormationModel.input_slice`. Raises BadModelError if B and K do not fit.
 
-    Two vehicles of one axis, each with a command of its own:
+    Two vehicles on one axis:
 
     >>> [late.tolist() for late in late_by_vehicle([[1, 0], [0, 1]], [[-1, 0], [1, -1]], [slice(0, 1), slice(1, 2)])]
     [[[-1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, -1.0]]]
@@ -108,7 +107,7 @@ def crossing_curves(
 ) -> tuple[Polyline, ...]:
     """All curves in the plane of two delays (s) along which roots lie on the imaginary axis, up to `longest_s`.
 
-    Followed from crossings on a grid of angles: a search, not a proof. Arguments as of `boundary_of_two_delays`.
+    Curves start from crossings on a grid of angles: a search, not a proof. Arguments as for `boundary_of_two_delays`.
     """
     if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
         raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
@@ -127,10 +126,10 @@ def boundary_of_two_delays(
 
     A piece is part of the edge if no root lies right of the axis on it. The edge may surround several regions; where it
     has no piece, the axes and `longest_s` bound them. A search, not a proof. A0, A1 and A2 are real matrices (n, n) in
-    1/s that act at once, tau_1 late and tau_2 late; BadModelError unless they are square, finite and of one size and
-    both of `longest_s` are positive and finite.
+    1/s that act without delay, with tau_1 and with tau_2; BadModelError unless they are square, finite and of one size
+    and both entries of `longest_s` are positive and finite.
 
-    Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
+    At tau_2 = 0, x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) is stable up to tau_1 = acos(-0.5) / sqrt(0.75) = 2.4184:
 
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
@@ -150,7 +149,7 @@ def boundary_of_two_delays(
 
 
 def _images(matrices: tuple[FloatArray, ...], curve: FloatArray, longest_s: tuple[float, float]) -> Iterator[Polyline]:
-    """The images of one curve of solutions in the box of delays, for all whole turns p and q."""
+    """The polylines of delays that one curve of solutions has in the box, for all whole turns p and q."""
     omega, angles = curve[:, :1], curve[:, 1:]
     first = np.ceil((-angles / (2.0 * pi)).min(axis=0)).astype(int)
     last = np.floor(((np.array(longest_s) * omega - angles) / (2.0 * pi)).max(axis=0)).astype(int)
@@ -161,7 +160,7 @@ def _images(matrices: tuple[FloatArray, ...], curve: FloatArray, longest_s: tupl
 
 @dataclass(frozen=True, eq=False)
 class _Image:
-    """The delays that belong to a curve of solutions after whole turns p and q."""
+    """The curve of delays that a curve of solutions maps to with p and q whole turns added to its angles."""
 
     matrices: tuple[FloatArray, ...]
     curve: FloatArray
@@ -169,7 +168,7 @@ class _Image:
     longest_s: tuple[float, float]
 
     def inside(self) -> Iterator[Polyline]:
-        """The stretches in the box, each up to the points where the curve enters and leaves it."""
+        """The pieces inside the box, each including the points where the curve enters and leaves it."""
         delays_s = self._delays_s(self.curve)
         for begin, end in _runs(self._is_inside(delays_s)):
             points, omega = delays_s[begin:end], self.curve[begin:end, 0]
@@ -212,6 +211,6 @@ class _Image:
 
 
 def _runs(kept: BoolArray) -> Iterator[tuple[int, int]]:
-    """Begin and end of each stretch that is kept."""
+    """Begin and end (exclusive) of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
     return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Delay margins by a sweep: second opinions that share no algebra with `gains.delay.constant`. Searches, not proofs.
+"""Delay margins by sweeps: second opinions that share no algebra with `gains.delay.constant`. Searches, not proofs.
 
 P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
 thesis, NIT Rourkela, 2012, Theorem 2: with A0 + A1 Hurwitz, the margin is the least theta / omega over all omega > 0
@@ -23,9 +23,9 @@ _ON_AXIS = 1e-9
 def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """Delay margin (s) of x'(t) = A0 x(t) + A1 x(t - tau) by a frequency sweep, refined where a modulus is near one.
 
-    0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies of
-    A0 and of A0 + A1, and every local extremum near one of every sorted modulus is located. A0 and A1 are real matrices
-    (n, n) in 1/s; BadModelError unless they are square, finite and of one size.
+    0 if A0 + A1 is not Hurwitz, `inf` if no modulus reaches one. The sweep is dense near the natural frequencies of
+    A0 and of A0 + A1, and refines every local extremum of a sorted modulus that is near one. A0 and A1 are real
+    matrices (n, n) in 1/s; BadModelError unless they are square, finite and of one size.
 
     >>> round(frequency_sweep_margin([[0]], [[-1]]), 6)  # pi / 2
     1.570796
@@ -39,8 +39,8 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
 
     Where an eigenvalue s of A(theta) = sum_k A_k e^{-j k theta} crosses the imaginary axis at j omega, tau = theta /
     omega is critical. Sorted real parts are continuous in the angle, so crossings can be bracketed, and local extrema
-    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Raises as
-    `gains.delay.constant.analyse_delay` does of these matrices.
+    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. BadModelError unless
+    the matrices are square, finite and of one size.
     """
     checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
     return min(_circle_margin(balanced(*block.matrices)) for block in distinct_blocks(*checked))
@@ -64,7 +64,7 @@ def _circle_margin(terms: Sequence[FloatArray]) -> float:
     scale, loci = norm_of(terms), circle_loci(terms)
     angles = np.array([crossing.omega for crossing in unit_crossings(loci, circle_points(terms))])
     margin_s = inf
-    # several roots may cross at nearly one angle (all of them, if nothing acts at once): take all that are on the axis
+    # several roots may cross at nearly one angle (all, if no term acts without delay): take all that are on the axis
     for theta, row in zip(angles.tolist(), np.log(loci(angles)) * scale if angles.size > 0 else (), strict=True):
         for root in row[np.abs(row.real) <= max(_ON_AXIS * scale, float(np.abs(row.real).min()))].tolist():
             # -j omega belongs to the angle -theta

@@ -1,9 +1,9 @@
-"""Overlapping gains for a formation, with the delay they take and the disturbance they withstand.
+"""Overlapping gains for a formation, with their delay margin and robustness.
 
-`design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
-`evaluate_gains` reports the same figures of given gains. Both check their result on the whole formation, with methods
-that share no formula with the search. The margin asked for is that of the loop as flown, sampled and held, with all
-feedback late: about half a period less than the continuous one. Both are reported.
+`design` finds the gains with the largest robustness α at a required delay margin, or with the largest delay margin at a
+required α; `evaluate_gains` reports the same figures for given gains. Both check their result on the whole formation,
+with methods that share no formula with the search. The required margin is that of the loop as flown, sampled and held,
+with all feedback late: about half a period less than the continuous margin. Both margins are reported.
 
 Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
@@ -33,9 +33,9 @@ from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
-# The certificate proves this share of α: at α itself a proof only just exists.
+# The certificate proves this share of α: at α itself a proof barely exists.
 _CERTIFIED_SHARE = 1 - 1e-4
-# A wanted decay rate is met to this share of itself: a double root is known to the square root of rounding.
+# Relative tolerance on a required decay rate: a double root is known to the square root of rounding.
 _DECAY_ROUNDING = 1e-6
 _TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 
@@ -50,29 +50,29 @@ class TradeOffPoint:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Gains, what they are good for, and how that is known."""
+    """Gains of a formation, their figures, and the evidence for them."""
 
     K1: FloatArray
     K2: FloatArray
     K3: FloatArray
-    """Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
-    shape (axes, axes)."""
+    """Gains on a vehicle's own velocity error (1/s), on that of the vehicle in front (1/s) and on the spacing error
+    (1/s²), each of shape (axes, axes)."""
     feed_forward: float
-    """Share of the command of the vehicle in front that each follower adds; margins are the same without."""
+    """Share of the command of the vehicle in front that each follower adds; it does not affect the margins."""
     alpha: float
     """Exact sector bound for W = I, `gains.performance.robust.robustness`; 0 if the loop is unstable."""
     delay_margin_s: float
     delay_margin_continuous_s: float
-    """Margin of the sampled loop and of the continuous one, all feedback late."""
+    """Margins of the sampled and of the continuous loop, with all feedback late."""
     period_s: float
     vehicles: int
     leader: BlockMargin
     follower: BlockMargin
-    """The continuous margin block by block."""
+    """The continuous margins of the leader's block and of a follower's block."""
     behaviour: Behaviour
     certificate: Certificate | None
-    """Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or badly scaled given gains have
-    none."""
+    """Lyapunov proof of 0.9999 α; None if the loop is unstable, if its α is below 5e-4, or if none is found for given
+    gains because they are badly scaled."""
     requirement: Requirement | None = None
     method: Literal["inclusion", "given"] = "inclusion"
     loop: Literal["ground"] = "ground"
@@ -115,18 +115,18 @@ def design(
     pattern: Pattern | None = None,
     onboard: OnboardTiming | None = None,
 ) -> Design | GraphDesign:
-    """Return the gains that meet the requirement and are best in what it leaves open.
+    """Return the gains that meet the requirement and are otherwise best.
 
     The formation is a leader and any number of followers; a leader alone gets the same gains, with the margin of its
-    own loop. The requirement is a sampled delay margin of 0.3 s if not given. Commands are sampled and held every
-    `period_s`. `method` is the inclusion principle, or a method of the graph route (`gains.design.graph`), which also
-    takes a `pattern` that says who may use whose output, the leader-follower pattern (4.6) if not given, and `onboard`,
-    the timing of the onboard loop, if that is flown.
+    own loop. The default requirement is a sampled delay margin of 0.3 s. Commands are sampled and held every
+    `period_s`. `method` is the inclusion principle, or a method of the graph route (`gains.design.graph`). The graph
+    route also takes an information `pattern`, by default the leader-follower pattern (4.6), and `onboard`, the timing
+    of the onboard loop if that is flown.
 
-    Raises BadModelError if the period is not positive or the method unknown, InfeasibleError if no gains meet the
-    requirement, with what can be reached, and DisagreementError if the exact analysis contradicts the search.
+    Raises BadModelError if the period is not positive or the method unknown; InfeasibleError if no gains meet the
+    requirement, saying what can be reached; DisagreementError if the exact analysis contradicts the search.
 
-    A leader and two followers in a chain, with a delay margin of 0.3 s at 50 Hz:
+    A leader and two followers in a chain get a delay margin of 0.3 s at 50 Hz:
 
     >>> found = design(FormationModel((-1, 0, 1)), Requirement(delay_margin_s=0.3), period_s=0.02)
     >>> round(found.delay_margin_s, 4), found.K1.shape
@@ -177,19 +177,19 @@ def evaluate_gains(
 ) -> Design | GraphDesign:
     """Return margins, robustness and decay of given gains.
 
-    Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate. `gains` are K1, K2
-    and K3, each of shape (axes, axes), or with a `pattern`, which says who may use whose output, K of u = K e, shape
-    (inputs, states). Commands are sampled and held every `period_s`. With K1, K2 and K3 each follower may add the share
-    `feed_forward` of the command of the vehicle in front. Raises BadModelError if a gain is not finite, not of its
-    shape or not in the pattern, the share not from 0 to 1, or the period not positive.
+    If the loop is unstable, α and the margins are 0 and there is no certificate. `gains` are K1, K2 and K3, each of
+    shape (axes, axes), or with an information `pattern` K of u = K e, shape (inputs, states). Commands are sampled and
+    held every `period_s`. With K1, K2 and K3 each follower may add the share `feed_forward` of the command of the
+    vehicle in front. Raises BadModelError if a gain is not finite, has a wrong shape or does not have the pattern, if
+    the share is not from 0 to 1, or if the period is not positive.
 
-    K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
+    With K1 = −1, K3 = 1 the margin is 0.711119 s, or half a period less when sampled:
 
     >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), ([[-1]], [[0]], [[1]]), period_s=0.02)
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
     """
-    Requirement(feed_forward=feed_forward)  # refuses what is no share
+    Requirement(feed_forward=feed_forward)  # checks the range
     if pattern is not None:
         return assess(formation, pattern, checked_pattern_gain(pattern, gains), period_s=period_s)
     own, front, spacing = (
@@ -201,11 +201,11 @@ def evaluate_gains(
 def _assess(
     formation: FormationModel, gains: Gains, share: float, *, period_s: float, requirement: Requirement | None
 ) -> Design:
-    """Everything that is reported of gains, given or designed to a requirement, for the whole formation.
+    """The full report on gains, given or designed to a requirement, for the whole formation.
 
-    `share` is the feed-forward. A follower behind the leader gets `share` K1 e_leader^v by it, as if K2 were larger.
+    `share` is the feed-forward. It adds `share` K1 e_leader^v to a follower behind the leader, like a larger K2.
     """
-    # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
+    # scipy.sparse takes a quarter of a second to import; commands that only read a design need not wait for it.
     from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
     A, B, K = formation.A, formation.B, formation.overlapping_gain(*gains)
@@ -244,7 +244,7 @@ def _assess(
 
 
 def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
-    """The proof of α. Given gains may be badly scaled: they do without one where none is found."""
+    """Proof of α; None if α is too small, or if none is found for given gains, which may be badly scaled."""
     if alpha < ALPHA_MIN:
         return None
     try:
@@ -262,10 +262,10 @@ def trade_off(
     loop: Literal["ground", "onboard"] = "ground",
     feed_forward: float = 0.0,
 ) -> tuple[TradeOffPoint, ...]:
-    """Return the largest α at sampled delay margins from 0.05 to 1 s, without those that no gains have.
+    """Return the largest α at sampled delay margins from 0.05 to 1 s, omitting margins that no gains reach.
 
     Arguments as in `gains.core.requirement.Requirement`; commands are sampled and held every `period_s`. Raises
-    BadModelError if the period is not positive or another argument is out of its range.
+    BadModelError if the period is not positive or another argument is out of range.
 
     >>> points = trade_off(period_s=0.02)
     >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha

@@ -1,16 +1,16 @@
 """Gains with a given information pattern by alternating between a Lyapunov matrix and the gain (D-K type iteration).
 
-For x' = A x + B u, y = C x, u = K y find K with the pattern and a small α with a proof P::
+For x' = A x + B u, y = C x, u = K y find K with the pattern and the smallest possible α with a proof P::
 
     (A + B K C)'P + P (A + B K C) ⪯ α P,    I ⪯ P ⪯ κ I,    ‖K‖ ≤ k̄                         (1)
 
-so that every motion of the loop decays at least like e^{αt/2}. With K fixed (1) is linear in P, with P fixed in K and
-α; each step can only lower α. The start is K = 0 and the α of P = I. P is perturbed by ε 11' before every gain step,
-because no gain helps where P decouples states from inputs.
+so that every motion of the loop decays at least like e^{αt/2}. (1) is linear in P for fixed K, and in K and α for fixed
+P; each step can only lower α. The iteration starts from K = 0 and the α of P = I. P is perturbed by ε 11' before every
+gain step, because no gain helps if P decouples states from inputs.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4.4. It prints "… + αI ⪯ 0, minimise α", which is unbounded
-below; with αP and P normalised, its stop at α < 0 is the test of stability that is meant. Its bound on K allows
-‖K‖ < 10 only, less than the gains it prints; here k̄ bounds ‖K‖ itself. Its fixed ε = 0.1 can raise α; here ε is halved
+below; with αP and P normalised, stopping at α < 0 is the stability test that it intends. Its bound on K only allows
+‖K‖ < 10, less than the gains it prints; here k̄ bounds ‖K‖ itself. Its fixed ε = 0.1 can raise α; here ε is halved
 until it does not.
 """
 
@@ -27,14 +27,14 @@ from gains.core.errors import BadModelError, DisagreementError, InfeasibleError,
 from gains.core.structure import roots_of
 from gains.formation.pattern import Pattern, Plant, check_fits
 
-# At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.
+# With 40 states an iteration takes the solver seconds, with 60 a minute. A formation needs only the states of one axis.
 LARGEST_STATES = 40
 # k̄, κ and the first ε
 _GAIN_BOUND, _LYAPUNOV_BOUND, _PERTURBATION = 20.0, 100.0, 0.1
 _ADVICE = "scale states and inputs to like size, or add links"
 _ITERATIONS = 200
 _HALVINGS = 12
-# the iteration has settled when α falls by less than this share of its scale in each of some iterations in a row
+# the iteration has settled when α falls by less than this share of its scale in this many consecutive iterations
 _SETTLED, _SETTLED_IN_A_ROW = 1e-3, 3
 
 
@@ -48,12 +48,12 @@ class DkIterate:
 
 @dataclass(frozen=True, eq=False)
 class DecayProof:
-    """P of (1) and the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}."""
+    """P of (1) and its checked eigenvalues: V = x'Px proves that motions decay like e^{αt/2}."""
 
     P: FloatArray
     """Symmetric, shape (n, n)."""
     alpha: float
-    """1/s; negative: the loop is stable."""
+    """1/s; negative, which proves the loop stable."""
     P_eigenvalue_min: float
     """Positive."""
     inequality_eigenvalue_max: float
@@ -62,26 +62,26 @@ class DecayProof:
 
 @dataclass(frozen=True, eq=False)
 class DkDesign:
-    """Gain of the D-K type iteration."""
+    """Gain found by the D-K type iteration."""
 
     K: FloatArray
     """Shape (inputs, outputs), with the pattern's zeros."""
     proof: DecayProof
-    """Of the last α; the decay rate is −α/2 or more."""
+    """Proof of the last α; the decay rate is at least −α/2."""
     iterates: tuple[DkIterate, ...]
-    """All of them, the first with K = 0; α falls."""
+    """All iterations, the first with K = 0; α decreases."""
     solver: SolverFacts | None
-    """Of all steps together: seconds and iterations are sums. None if K = 0 is stable."""
+    """Facts of all steps together: seconds and iterations are sums, sizes maxima. None if K = 0 is stable."""
 
 
 def dk_iteration(plant: Plant, pattern: Pattern) -> DkDesign:
     """Return the first gain of the iteration that is proved to stabilise.
 
-    Raises BadModelError if sizes do not fit or there are more than `LARGEST_STATES` states, InfeasibleError if the
-    iteration settles before, with the rate, and SolverError if the solver ends a step with a status other than
+    Raises BadModelError if sizes do not fit or there are more than `LARGEST_STATES` states; InfeasibleError, with α, if
+    the iteration settles before it proves stability; SolverError if the solver ends a step with a status other than
     "optimal".
 
-    Two integrators in a row, both measured:
+    A double integrator with both states measured:
 
     >>> found = dk_iteration(Plant([[0, 1], [0, 0]], [[0], [1]]), Pattern([[1]], (1,), (2,)))
     >>> found.proof.alpha < 0, found.iterates[-1].abscissa < 0
@@ -125,7 +125,7 @@ def _together(effort: list[SolverFacts]) -> SolverFacts | None:
 
 
 def _lyapunov_step(states: int, effort: list[SolverFacts]) -> Callable[[FloatArray, float], FloatArray]:
-    """From a closed loop and α to the P, I ⪯ P ⪯ κI, for which (1) holds with most to spare; compiled once."""
+    """A function from closed loop and α to the P, I ⪯ P ⪯ κI, with the largest slack in (1); compiled once."""
     import cvxpy as cp
 
     identity = np.eye(states)
@@ -145,7 +145,7 @@ def _lyapunov_step(states: int, effort: list[SolverFacts]) -> Callable[[FloatArr
 
 
 def _gain_step(plant: Plant, mask: BoolArray, effort: list[SolverFacts]) -> Callable[[FloatArray], FloatArray]:
-    """From P to the K with the pattern and ‖K‖ ≤ k̄ for which (1) holds with the least α; compiled once."""
+    """A function from P to the K with the pattern, ‖K‖ ≤ k̄, that has the least α in (1); compiled once."""
     import cvxpy as cp
 
     rows, columns = mask.shape
@@ -167,7 +167,7 @@ def _gain_step(plant: Plant, mask: BoolArray, effort: list[SolverFacts]) -> Call
 def _best_gain(
     plant: Plant, gain_step: Callable[[FloatArray], FloatArray], held: tuple[FloatArray, FloatArray, float]
 ) -> tuple[FloatArray, FloatArray, DkIterate]:
-    """Gain step at P + ε 11', with the largest ε, ε/2, ε/4, ... that does not raise α; else the gain held."""
+    """Gain step at P + ε 11' with the largest of ε, ε/2, ε/4, ..., 0 that lowers α; otherwise the current gain."""
     K_held, P, alpha_held = held
     for halving in range(_HALVINGS):
         perturbed = P + (_PERTURBATION / 2**halving if halving < _HALVINGS - 1 else 0.0)
@@ -179,11 +179,11 @@ def _best_gain(
 
 
 def _iterate(plant: Plant, K: FloatArray, P: FloatArray) -> DkIterate:
-    """The α that P proves for K, and its check against the eigenvalues of the loop."""
+    """The α that P proves for K, checked against the eigenvalues of the loop."""
     closed_loop = plant.closed_loop(K)
     alpha = _proved_alpha(closed_loop, P)
     rightmost = abscissa(closed_loop)
-    # α is at least twice the abscissa for every P; a defective eigenvalue has the root of the rounding as its error
+    # α is at least twice the abscissa for every P; a defective eigenvalue is known to the square root of rounding
     if 2 * rightmost > alpha + 1e-6 * (1 + float(np.linalg.norm(closed_loop, 2))):
         raise DisagreementError(
             f"the Lyapunov matrix proves alpha = {alpha:.6g} 1/s, but the rightmost eigenvalue is {rightmost:.6g} 1/s; "
@@ -216,7 +216,7 @@ def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
     if P_min <= 0:
         raise SolverError(f"the Lyapunov matrix has the eigenvalue {P_min:.3g}; positive ones are wanted")
     least_alpha = _proved_alpha(closed_loop, P)
-    # room for the rounding of the check, far below what any figure shown resolves
+    # allowance for rounding in the check, far below the resolution of any figure shown
     alpha = least_alpha + 1e-9 * abs(least_alpha)
     inequality = closed_loop.T @ P + P @ closed_loop - alpha * P
     inequality_max = float(np.linalg.eigvalsh(inequality)[-1])

@@ -1,9 +1,9 @@
-"""Gains that are best at a loop delay: the one place that searches them there.
+"""Search for gains that are best at a loop delay; all such searches are here.
 
 Gains with a margin of twice a delay are not the best at that delay: at 0.3 s and 50 Hz they decay at 1.31 1/s there and
-withstand α = 0.525; gains searched for the delay decay at 1.89 1/s, or withstand 0.632. The search compares gains by
-the figures of `gains.criteria.figures` at the delay, first by how far they are from the requirement, then by what is
-maximised. What decays fastest is known in closed form, and no search begins worse.
+withstand α = 0.525; gains searched for the delay decay at 1.89 1/s, or withstand 0.632. The search ranks gains by the
+figures of `gains.criteria.figures` at the delay: first by their shortfall from the requirement, then by the objective.
+The gains with the fastest decay are known in closed form, and every search includes them in its starts.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,37 +34,37 @@ from gains.sampled.multirate import Timing, multirate_growth_rate
 Reached = tuple[FloatArray, Figures]
 """A point of a family and its exact figures."""
 
-# How many gains a search compares: for each free entry, and of any family at least and at most.
+# Gains compared per search: for each free entry, and the least and the most for any family.
 _EVALUATIONS_EACH, _EVALUATIONS_LEAST, _EVALUATIONS_MOST = 50, 320, 1280
-# Searches until gains meet with exact figures what they met with rough ones.
+# Most searches until the gains meet with exact figures the requirement that they met with rough ones.
 _AIMS = 4
-# A search of more than a few entries is continued from its best point with shorter steps, by these divisors: it may
-# have started so near to what is wanted that nearly all first draws were farther away.
+# A search over more than a few entries is repeated from its best point with steps divided by these: it may have started
+# so close to the optimum that nearly all first draws were worse.
 _FEW, _FINER = 3, (4.0, 16.0)
-# Frequencies left out while searching; peaks are looked at closer in any case.
+# While searching, frequencies are thinned by this factor; peaks are refined all the same.
 _THINNED = 4
-# At no delay and no hold gains have no scale of their own: the search begins at that of this delay.
+# Without delay and hold, gains have no scale of their own: the search starts at the scale of this delay.
 _NO_DELAY_S = 0.1
 # Shares by which several parts are relaxed together, as multiples of the largest shortfall of the nearest gains.
 _SHARES = 1.0, 1.5, 2.0, 3.0
-# a shortfall, in logarithms, from which nothing can be said of how far to relax: what is missed is out of reach
+# shortfall, as a logarithm, from which no advice on relaxing is possible: the figure is out of reach
 _HOPELESS = 100.0
-# how far an unstable loop counts as being from any requirement
+# shortfall of an unstable loop
 _UNSTABLE = 1e4
-# and one that meets no part that is quick to compute; above every shortfall of those that are not
+# added to the shortfall of a loop that misses a part that is quick to compute; exceeds the shortfall in any slow part
 _SLOW_PARTS = 2e3
-# margins from which gains on a pattern are started, as multiples of the delay with half a hold
+# margins at which gains on a pattern start, as multiples of the delay plus half a hold
 _SPARES = 1.5, 2.0, 3.0, 6.0, 12.0
-# and of gains behind another vehicle, as multiples of the fastest at the delay
+# values of k1 at which gains behind another vehicle start, as multiples of the fastest ones at the delay
 _SCALES = 1.0, 1.7, 0.3, 0.1
 _FASTEST = 2.0 - sqrt(2.0)
-# With a response: frequencies of a root at the wanted decay, up to this many times it, by how much (1/s) rounding may
-# make another root slower, and how well the delay is known.
+# With a response: number of frequencies of a root at the wanted decay, up to this many times the decay; by how much
+# (1/s) rounding may make another root slower; resolution of the delay.
 _FREQUENCIES, _HIGHEST, _NO_SLOWER, _RESOLUTION_S = 100, 5.0, 1e-6, 1e-4
 
 
 def fastest_at_delay(late_s: float) -> tuple[float, float]:
-    """Return the (k1, k3) with which s² + (k1 s + k3) e^{−s late} decays fastest: a triple root at −(2 − √2) / late.
+    """Return the (k1, k3) for which s² + (k1 s + k3) e^{−s late} decays fastest: a triple root at −(2 − √2) / late.
 
     Raises BadModelError if the delay is not positive.
 
@@ -82,9 +82,9 @@ def longest_static_delay(
 ) -> tuple[float, ScalarGains]:
     """Return the longest loop delay (s) at which static gains decay at a rate (1/s), and these gains, with k2 = 0.
 
-    None decay as fast if it is 0 or less. Of vehicles that respond at once it follows from `fastest_at_delay`, and a
-    hold counts as half a period. With a `response` the loop is that of one period: gains with a root at (-decay + j w)
-    are linear in (k1, k3), and the delay is raised while those of any w of a grid have no slower root.
+    If the delay is 0 or less, no gains decay this fast. If vehicles respond at once, `fastest_at_delay` gives it, and a
+    hold counts as half a period. With a `response` the loop is sampled and held: the equation for a root at
+    (-decay + j w) is linear in (k1, k3); the delay is raised while the gains of some w of a grid have no slower root.
 
     A lag of 0.15 s costs nearly half of the delay:
 
@@ -124,14 +124,14 @@ def longest_static_delay(
 
 
 def criteria_gains(wanted: Requirement, period_s: float, response: Response | None = None) -> ScalarGains:
-    """Return the gains of the inclusion principle that meet a requirement with criteria and are best in its objective.
+    """Return the gains of the inclusion principle that meet a requirement with criteria and have the best objective.
 
-    They are the same for every vehicle of a leader-follower tree of any size; each has the `response`, or responds at
-    once. Commands are held for `period_s`, which counts as half a period of delay. The α of the result is that at the
-    delay. BadModelError if the period is not positive; InfeasibleError if no gains were found, with how far each part
-    alone would have to be relaxed.
+    They are the same for every vehicle of a leader-follower tree of any size. Each vehicle has the `response`, or
+    responds at once. Commands are held for `period_s`, which counts as half a period of delay. The α of the result is
+    the one at the delay. BadModelError if the period is not positive; InfeasibleError if no gains were found, saying
+    how far each part alone would have to be relaxed.
 
-    Fastest decay at 0.3 s and 50 Hz:
+    The gains with the fastest decay at 0.3 s and 50 Hz:
 
     >>> from gains.core.requirement import Criteria, Requirement
     >>> fastest = Criteria(at_delay_s=0.3, maximise="decay_rate_at_delay_1_s")
@@ -148,7 +148,7 @@ def criteria_gains(wanted: Requirement, period_s: float, response: Response | No
 
 
 class GainFamily(Protocol):
-    """Gains that a search chooses from."""
+    """A family of gains to search, parametrised by points."""
 
     @property
     def step(self) -> float:
@@ -157,11 +157,11 @@ class GainFamily(Protocol):
 
     @property
     def starts(self) -> Sequence[FloatArray]:
-        """Points from which to search."""
+        """Points at which to start; the search begins at the best of them."""
         ...
 
     def figures(self, point: FloatArray) -> Figures:
-        """The figures of the gains of a point."""
+        """The figures of the gains at a point."""
         ...
 
 
@@ -171,9 +171,9 @@ def _late_s(delay_s: float | None, timing: FlownTiming) -> float:
 
 @dataclass(frozen=True)
 class TreeGains:
-    """k1, k2 and k3 of a vehicle behind another; a point is (ln k1 late, k2 / k1, ln k3 / k1²).
+    """k1, k2 and k3 of a vehicle behind another; a point is (ln(k1 late), k2 / k1, ln(k3 / k1²)).
 
-    Vehicles respond at once if they have no `response`.
+    Without a `response`, vehicles respond at once.
     """
 
     delay_s: float | None
@@ -185,7 +185,7 @@ class TreeGains:
 
     @property
     def late_s(self) -> float:
-        """The delay with half a hold, and about what the response adds."""
+        """The delay plus half a hold and roughly the delay of the response."""
         slow_s = 0.0 if self.response is None else self.response.lag_s + self.response.dead_time_s
         return _late_s(self.delay_s, self.timing) + slow_s
 
@@ -195,7 +195,7 @@ class TreeGains:
         return [np.array([log(scale * k1 * self.late_s), 0.2, log(k3 / k1**2)]) for scale in _SCALES]
 
     def gains(self, point: FloatArray) -> ScalarGains:
-        """The gains of a point; their α is not known."""
+        """The gains at a point; their α is not computed and set to 0."""
         first, share, last = (float(entry) for entry in np.clip(point, -20.0, 20.0))
         k1 = exp(first) / self.late_s
         return ScalarGains(k1, share * k1, exp(last) * k1**2, 0.0)
@@ -209,12 +209,12 @@ class TreeGains:
 
 @dataclass(frozen=True, eq=False)
 class PatternGains:
-    """The free entries of K on a pattern, for one axis; a point holds them in the unit of time of the delay."""
+    """The free entries of K on a pattern, for one axis; a point holds them in units of the delay plus half a hold."""
 
     model: FormationModel
     mask: BoolArray
     bases: tuple[FloatArray, ...]
-    """Gains (inputs, states) that stabilise, from which to start in several time scales."""
+    """Stabilising gains (inputs, states) at which to start, in several time scales."""
     delay_s: float | None
     timing: FlownTiming
     weight: tuple[float, float] | None = None
@@ -223,7 +223,7 @@ class PatternGains:
 
     @cached_property
     def _units(self) -> FloatArray:
-        """What one unit of a point is worth at each entry: 1 / late for velocity errors, 1 / late² for spacing."""
+        """Unit of each entry of a point: 1 / late for velocity errors, 1 / late² for spacing errors."""
         late_s = _late_s(self.delay_s, self.timing)
         units = np.full(self.mask.shape, 1.0 / late_s)
         units[:, self.model.spacing_mask] /= late_s
@@ -239,7 +239,7 @@ class PatternGains:
             for spare in _SPARES
         )
         tree = TreeGains(self.delay_s, self.timing)
-        # for every vehicle, those behind another
+        # the starts for a vehicle behind another, given to every vehicle
         own = [tree.gains(point).gain_of(self.model) for point in tree.starts]
         return [self.point(K) for K in (*scaled, *own)]
 
@@ -258,11 +258,11 @@ class PatternGains:
 
 
 def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None = None) -> Reached:
-    """Return the point of a family that meets a requirement with criteria and is best in its objective, with figures.
+    """Return the point of a family that meets a requirement with criteria and has the best objective, with its figures.
 
-    `evaluations` is how many gains are compared; None: more, the more free entries they have. InfeasibleError if none
-    was found that is stable and meets the requirement; its message says how far each part alone, or several together,
-    have to be relaxed. Whoever asks for exactly that gets gains: those by which the message was found are found again.
+    `evaluations` is the number of gains compared; if None, it grows with the number of free entries. InfeasibleError if
+    no gains were found that are stable and meet the requirement; the message says how far each part alone, or several
+    together, must be relaxed. A requirement relaxed as advised is met: the search finds the same gains again.
     """
     assert wanted.criteria is not None
     objective = wanted.criteria.objective or ("alpha" if wanted.delay_margin_s is not None else "delay_margin_s")
@@ -286,7 +286,7 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None
 
 
 def _refusal(family: GainFamily, parts: Sequence[Part], most: Sequence[Reached], nearest: Figures) -> str:
-    """What cannot be had together, and how far to relax each part alone, or several if none helps alone."""
+    """Message naming the parts in conflict, and how far to relax each alone, or several if none alone is enough."""
     named = " and ".join(f"{part.name} = {part.wanted_text}" for part in parts)
     conflict = "exclude each other" if len(parts) > 1 else "cannot be reached"
     alone = [_relaxed(part, reached, parts) for part, reached in zip(parts, most, strict=True)]
@@ -295,13 +295,13 @@ def _refusal(family: GainFamily, parts: Sequence[Part], most: Sequence[Reached],
 
 
 def _relaxed(part: Part, reached: Reached, parts: Sequence[Part]) -> Part | None:
-    """A part for what gains reach of it; None if they miss another one."""
+    """The part relaxed to what the gains reach; None if they miss another part."""
     _, figures = reached
     return part.relaxed(figures) if _meets(figures, [other for other in parts if other is not part]) else None
 
 
 def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> str:
-    """The advice to relax all that the nearest gains miss by one share, the last of it as far as is then needed."""
+    """Advice to relax the parts that the nearest gains miss by a common share, the last one as far as then needed."""
     short = [part.shortfall(nearest) for part in parts]
     for share in (max(short) * times for times in _SHARES if max(short) < _HOPELESS):
         eased = [part.eased(share) if each > 0.0 else part for part, each in zip(parts, short, strict=True)]
@@ -312,9 +312,9 @@ def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> st
 
 
 def _most(family: GainFamily, part: Part, parts: Sequence[Part], evaluations: int | None = None) -> Reached:
-    """The gains that reach most of a part of those that meet all others.
+    """The gains that reach most in one part among those that meet all others.
 
-    How much is wanted of the part does not matter, so that whoever wants what they reach finds the same gains.
+    The value wanted of the part has no influence, so a requirement for what they reach leads to the same gains.
     """
     sign = 1.0 if part.at_least else -1.0
     others = [other for other in parts if other is not part]
@@ -328,9 +328,9 @@ def _best(
     starts: Sequence[FloatArray],
     evaluations: int | None,
 ) -> Reached:
-    """The gains of least cost that meet the parts, or the nearest to them: a search from the best of the starts.
+    """The gains of least cost that meet the parts, or the nearest to them, searched from the best of the starts.
 
-    While searching, figures are rough. Gains that miss a part with exact ones are searched again, aiming higher.
+    Figures are rough during the search. It is repeated with a tighter aim if exact figures miss a part.
     """
     aims = parts
     enough = min(max(_EVALUATIONS_EACH * starts[0].size, _EVALUATIONS_LEAST), _EVALUATIONS_MOST)
@@ -356,9 +356,9 @@ def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
 
 
 def _shortfall(figures: Figures, parts: Sequence[Part]) -> float:
-    """How far gains are from all parts: the largest shortfall, or by how much the loop is unstable.
+    """The largest shortfall of gains in any part, or a larger number if the loop is unstable.
 
-    Parts that take long to compute are looked at only where all others are met.
+    Parts that are slow to compute are evaluated only if all others are met.
     """
     for slowest in (figures.decay_rate_1_s, figures.decay_rate_at_delay_1_s):
         if slowest <= 0.0:

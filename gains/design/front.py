@@ -1,8 +1,8 @@
-"""The best that can be had at a loop delay: robustness, decay, string peak and disturbance gain, by every route.
+"""The Pareto front at a loop delay: robustness, decay, string peak and disturbance gain, by every route.
 
-At each delay and for each route the ends of the front are searched, the gains with the largest α and those with the
-fastest decay, with prediction over the delay and without. All are asked for stability at every constant delay up to a
-share of the delay to either side, so that neither way counts on a delay that is known exactly.
+At each delay and for each route, both ends of the front are searched: the gains with the largest α and those with the
+fastest decay, with prediction over the delay and without. All must be stable at every constant delay within a share of
+the delay to either side, so that neither way relies on exact knowledge of the delay.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,16 +30,16 @@ from gains.performance.response import Response
 Method = Literal["inclusion", "graph-lqr"]
 Aim = Literal["alpha_at_delay", "decay_rate_at_delay_1_s"]
 AIMS: tuple[Aim, Aim] = "alpha_at_delay", "decay_rate_at_delay_1_s"
-# gains that a search compares; α is within about 2 % of that of a search three times as long
+# gains compared per search; α is within about 2 % of that of a search three times as long
 _EVALUATIONS: dict[Method, int] = {"inclusion": 120, "graph-lqr": 40}
-# by inclusion with a response, where the best decay has more roots side by side
+# the same by inclusion with a response, where the fastest decay has more roots side by side
 _EVALUATIONS_RESPONSE = 300
-# a point that is worse by no more than this share is not worse
+# figures that differ by no more than this share count as equal
 _ALIKE = 1e-3
 
 
 class Route(NamedTuple):
-    """A way to design, with or without prediction, and the end of the front that is wanted."""
+    """A design method, with or without prediction, and the end of the front to search."""
 
     method: Method
     predicted: bool
@@ -48,12 +48,12 @@ class Route(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrontPoint:
-    """The gains that a route finds for a loop delay, and their figures there; K (inputs, states) of one axis.
+    """The gains that a route finds for a loop delay, and their figures there; K (inputs, states) is of one axis.
 
-    `alpha` and `spacing_gain_s2` are of the whole formation, `alpha_design` is as the method reports it: of inclusion
-    that of one follower. `stable_s` are the constant delays about this one between which the loop is stable.
-    `is_efficient`: no other point at this delay is as good in α, decay, string peak and disturbance gain, and better in
-    one. Where errors run both ways no string peak is defined.
+    `alpha` and `spacing_gain_s2` are of the whole formation; `alpha_design` is the α that the method reports, for
+    inclusion that of one follower. `stable_s` is the range of constant delays around this one in which the loop is
+    stable. `is_efficient`: no other point at this delay is as good in α, decay, string peak and disturbance gain, and
+    better in one of them. `string_peak` is None if errors run both ways.
     """
 
     route: Route
@@ -79,9 +79,9 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrontSearch:
-    """What a front is made of. `tolerated` is the share by which the delay may differ from that designed for.
+    """Search for the points of a front. `tolerated` is the share by which the delay may differ from the design delay.
 
-    With a `response`, which then is that of every vehicle, it is made of gains by inclusion only.
+    With a `response`, common to all vehicles, the front consists of gains by inclusion only.
     """
 
     formation: FormationModel
@@ -92,7 +92,7 @@ class FrontSearch:
     response: Response | None = None
 
     def point(self, at: tuple[Route, float]) -> FrontPoint | Refusal:
-        """The point of a route at a loop delay (s)."""
+        """The point of a route at a loop delay (s), or why there is none."""
         route, delay_s = at
         family, gain = self._family(route, delay_s)
         evaluations = _EVALUATIONS[route.method] if self.response is None else _EVALUATIONS_RESPONSE
@@ -104,11 +104,11 @@ class FrontSearch:
 
     @cached_property
     def _graph(self) -> PatternGains:
-        """Gains on the pattern, with the LQR gains from which searches start."""
+        """The family of gains on the pattern, with the LQR gains from which searches start."""
         return lqr_bases(self.formation, self.pattern)
 
     def wanted(self, route: Route, delay_s: float) -> Requirement:
-        """What is asked of the gains at a delay."""
+        """The requirement on the gains at a delay."""
         around_s = (1.0 - self.tolerated) * delay_s, (1.0 + self.tolerated) * delay_s
         criteria = Criteria(delay_s, route.aim, delays_s=around_s, delay_rate=0.0)
         return Requirement(criteria=criteria, string_peak_max=self.string_peak_max)
@@ -118,7 +118,7 @@ class FrontSearch:
         return FormationModel(self.formation.predecessors, axes=1)
 
     def _family(self, route: Route, delay_s: float) -> tuple[GainFamily, Callable[[FloatArray], FloatArray]]:
-        """The gains that a route chooses from, and from a point of them to K of the whole formation."""
+        """The gain family of a route, and the function from its points to K of the whole formation."""
         timing = FlownTiming(inf, self.period_s)
         if route.method == "graph-lqr":
             gains = replace(self._graph, delay_s=delay_s, timing=timing)
@@ -151,7 +151,7 @@ class FrontSearch:
 
 
 def efficient(points: Sequence[FrontPoint]) -> list[FrontPoint]:
-    """The points, each compared with the others at its delay."""
+    """The points with `is_efficient` set by comparison with the others at the same delay."""
     return [
         replace(own, is_efficient=not any(_beats(other, own) for other in points if other.delay_s == own.delay_s))
         for own in points

@@ -1,9 +1,9 @@
 """Gains on any information pattern, designed to a requirement: the graph route.
 
-A base gain comes from the structured LQR (`gains.design.structured_lqr`) or the D-K type iteration
-(`gains.design.dk_iteration`), for one axis; the other axes get the same. A change of the time scale brings it to the
-requirement (`gains.design.time_scale`). The LQR route tries several ratios of the weights of spacing and velocity
-errors, and keeps the best in what the requirement leaves open.
+A base gain for one axis comes from the structured LQR (`gains.design.structured_lqr`) or the D-K type iteration
+(`gains.design.dk_iteration`); the other axes get the same gain. A change of time scale makes it meet the requirement
+(`gains.design.time_scale`). The LQR route tries several ratios of the weights of spacing and velocity errors, and keeps
+the gain that meets the requirement and is otherwise best.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4. The scaling to a requirement is ours.
 """
@@ -37,39 +37,39 @@ from gains.sampled.onboard import OnboardTiming
 
 GraphMethod = Literal["graph-dk", "graph-lqr"]
 
-# Ratios of the weight of spacing errors (1/m²) to that of velocity errors (s²/m²), in the unit of time of the base.
+# Ratios of the weight of spacing errors (1/m²) to that of velocity errors (s²/m²), in the time unit of the base gain.
 _WEIGHT_RATIOS = np.geomspace(0.03, 30.0, 9).tolist()
-# The decay rate that the certificate proves, as a share of the real one; less where the loop is nearly defective.
+# Shares of the decay rate that the certificate tries to prove; a nearly defective loop allows only a small one.
 _PROVED_SHARES = (0.9, 0.5, 0.1, 0.01)
 
 
 @dataclass(frozen=True, eq=False)
 class GraphDesign:
-    """A gain with an information pattern, what it is good for, and how that is known."""
+    """A gain with an information pattern, its figures, and the evidence for them."""
 
     K: FloatArray
     """u = K e, shape (inputs, states) of `gains.formation.model.FormationModel`."""
     links: tuple[Link, ...]
-    """The pattern: (i, j) where vehicle i uses the output of vehicle j, spacing and velocity error."""
+    """The pattern: (i, j) if vehicle i uses the output of vehicle j, its spacing and velocity error."""
     alpha: float
     """Exact sector bound of the whole formation for W = I: 1 / ‖(sI − A − BK)^{-1}‖∞. It falls with the length of a
-    chain, unlike that of one vehicle behind another, which `gains.design.design` reports."""
+    chain, unlike the α of one vehicle behind another that `gains.design.design` reports for inclusion."""
     decay_rate_1_s: float
-    """Of the slowest motion without delay; negative if unstable."""
+    """Decay rate of the slowest motion without delay; negative if unstable."""
     delay_margin_s: float
     delay_margin_continuous_s: float
-    """Margin of the sampled loop and of the continuous one, all feedback late."""
+    """Margins of the sampled and of the continuous loop, with all feedback late."""
     period_s: float
     vehicles: int
     certificate: DecayProof | None
-    """P that proves a share of the decay rate, checked by eigenvalues; None if the loop is unstable."""
+    """P that proves a share of the decay rate, checked by eigenvalues; None if the loop is unstable or P not found."""
     cost_loss: float | None
-    """Share by which the LQR cost is above that of the centralised optimum; None for other methods."""
+    """Relative excess of the LQR cost over the centralised optimum; None for other methods and with criteria."""
     subgraphs: int
     subgraphs_smallest: int
-    """Complete bipartite subgraphs of the partition by input and of the smallest one found."""
+    """Numbers of complete bipartite subgraphs in the partition by input and in the smallest one found."""
     solver: SolverFacts | None
-    """Of the base gain; None where no solver was used."""
+    """The solver's facts for the base gain; None if no solver was used, and with criteria."""
     requirement: Requirement | None
     method: Literal["graph-dk", "graph-lqr", "given"]
     loop: Literal["ground"] = "ground"
@@ -88,15 +88,15 @@ def graph_design(
     period_s: float,
     onboard: OnboardTiming | None = None,
 ) -> GraphDesign:
-    """Return the gain with the pattern that meets the requirement and is best in what it leaves open.
+    """Return the gain with the pattern that meets the requirement and is otherwise best.
 
-    Arguments are those of `gains.design.design.design`, but the requirement's `string_peak_max` is not used, as errors
-    run both ways in a general pattern. D-K takes at most 40 states an axis. With `onboard`, the timing of the onboard
-    loop, the requirement bounds the margin of that loop and that of the vehicles' own gains
-    (`gains.design.time_scale`). The margins reported are those of the ground loop in any case.
+    Arguments are those of `gains.design.design.design`, except that the requirement's `string_peak_max` is not used,
+    because errors run both ways in a general pattern. D-K takes at most 40 states per axis. With `onboard`, the timing
+    of the onboard loop, the requirement bounds the margin of that loop and that of the vehicles' own gains
+    (`gains.design.time_scale`). The reported margins are always those of the ground loop.
 
-    Raises BadModelError if the pattern is not one of the formation or the period is not positive; InfeasibleError if
-    the pattern cannot move a mode, with the missing link, or the requirement cannot be met, with what to relax;
+    Raises BadModelError if the pattern does not fit the formation or the period is not positive; InfeasibleError if the
+    pattern cannot move a mode, naming the missing link, or the requirement cannot be met, saying what to relax;
     SolverError if the base gain is not found (`gains.design.structured_lqr`, `gains.design.dk_iteration`).
     """
     wanted = requirement or Requirement()
@@ -125,9 +125,9 @@ def graph_design(
 
 
 def lqr_bases(formation: FormationModel, pattern: Pattern) -> PatternGains:
-    """Return the gains on a pattern, for one axis, that begin with those of the structured LQR.
+    """Return the gain family of a pattern, for one axis, that starts from the gains of the structured LQR.
 
-    They have no delay and no period yet. Raises as `graph_design` does.
+    It has no delay and no period yet. Raises as `graph_design` does.
     """
     single, narrow, plant = _narrowed(formation, pattern)
     bases = tuple(K for K, _, _ in _base_gains(plant, narrow, single, "graph-lqr"))
@@ -135,7 +135,7 @@ def lqr_bases(formation: FormationModel, pattern: Pattern) -> PatternGains:
 
 
 def _narrowed(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, Pattern, Plant]:
-    """Formation, pattern and plant of one axis, checked."""
+    """Formation, pattern and plant of one axis; raises if the pattern does not fit or cannot stabilise."""
     single = FormationModel(formation.predecessors, axes=1)
     if pattern.blocks.shape != (single.vehicles, single.vehicles):
         raise BadModelError(
@@ -150,7 +150,7 @@ def _narrowed(formation: FormationModel, pattern: Pattern) -> tuple[FormationMod
 def _base_gains(
     plant: Plant, pattern: Pattern, single: FormationModel, method: GraphMethod
 ) -> Iterable[tuple[FloatArray, float | None, SolverFacts | None]]:
-    """Base gains for one axis, each with its loss of cost and what the solver did."""
+    """Base gains for one axis, each with its `cost_loss` and the facts of its solver."""
     if method == "graph-dk":
         found = dk_iteration(plant, pattern)
         yield found.K, None, found.solver
@@ -172,7 +172,7 @@ def assess(
     loss: float | None = None,
     solver: SolverFacts | None = None,
 ) -> GraphDesign:
-    """Return everything that is reported of a gain with a pattern, for one axis or for all."""
+    """Return the full report on a gain with a pattern, given for one axis or for all."""
     narrow = K.shape[0] == formation.vehicles and formation.axes > 1
     model = FormationModel(formation.predecessors, axes=1) if narrow else formation
     A, B = model.A, model.B
@@ -199,7 +199,7 @@ def assess(
 
 
 def _certificate(closed_loop: FloatArray, decay_rate_1_s: float) -> DecayProof | None:
-    """A proof of the largest share of the decay rate that can be proved: P of A_K'P + P A_K + 2 r P = −I."""
+    """Proof of the largest provable share of the decay rate: P of A_K'P + P A_K + 2 r P = −I; None if there is none."""
     identity = np.eye(len(closed_loop))
     for share in _PROVED_SHARES:
         shifted = closed_loop + share * decay_rate_1_s * identity

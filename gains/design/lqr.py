@@ -22,18 +22,18 @@ from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix, strongly_connected_blocks
 from gains.formation.pattern import Plant
 
-# of an eigenvalue, relative to the norm
+# rounding error of an eigenvalue, relative to the norm
 _ROUNDING = 1e-15
 
 
 class Weights(NamedTuple):
-    """Weights of the cost, symmetric: Q (n, n) on states, positive semidefinite, and R (inputs, inputs), definite."""
+    """Symmetric weights: Q (n, n) on states, positive semidefinite; R (inputs, inputs) on inputs, positive definite."""
 
     Q: FloatArray
     R: FloatArray
 
     def fitting(self, plant: Plant) -> "Weights":
-        """The weights as arrays; raises BadModelError unless they are as above and of the plant's size."""
+        """The weights as arrays; raises BadModelError unless they are as above and match the plant's size."""
         arrays = Weights(real_matrix("Q", self.Q), real_matrix("R", self.R))
         for name, weight, size in (("Q", arrays.Q, plant.states), ("R", arrays.R, plant.B.shape[1])):
             least, wanted = (-1e-12, "semidefinite") if name == "Q" else (1e-14, "definite")
@@ -55,15 +55,14 @@ class CostPoint:
 
 
 class LyapunovEquations:
-    """Both Lyapunov equations of one closed loop, from one Schur form that follows the loop's block triangular form.
+    """Solver of both Lyapunov equations of a closed loop, from a Schur form that keeps its block triangular form.
 
-    Eigenvalues are computed by strongly connected blocks: as a whole, a chain of identical followers is one defective
-    eigenvalue, which rounding would spread into the right half plane. `abscissa` is the
-    largest real part of one, 1/s.
+    Eigenvalues are computed by strongly connected blocks: as a whole, a chain of identical followers has one defective
+    eigenvalue, which rounding would spread into the right half plane. `abscissa` is their largest real part, 1/s.
     """
 
     def __init__(self, A: FloatArray, blocks: list[IntArray]) -> None:
-        # driven blocks first makes the matrix block upper triangular
+        # ordering driven blocks first makes the matrix block upper triangular
         order = np.concatenate(blocks[::-1])
         self._basis = np.zeros(A.shape)
         triangular = A[np.ix_(order, order)]
@@ -77,7 +76,7 @@ class LyapunovEquations:
             triangular[:, place] = triangular[:, place] @ vectors
             triangular[place] = vectors.T @ triangular[place]
             triangular[place, place] = diagonal
-            # LAPACK's standard form has equal diagonal entries, the real parts, in every 2×2 block
+            # in LAPACK's standard form, both diagonal entries of a 2×2 block are the real part
             self.abscissa = max(self.abscissa, float(diagonal.diagonal().max()))
             start = place.stop
         self._triangular = triangular
@@ -116,7 +115,7 @@ class Cost:
         return LyapunovEquations(self.plant.closed_loop(K), self.blocks)
 
     def at(self, K: FloatArray) -> CostPoint | None:
-        """The point of a gain, None if it does not stabilise."""
+        """The `CostPoint` of a gain, None if it does not stabilise."""
         plant, weights = self.plant, self.weights
         equations = self.lyapunov(K)
         if equations.abscissa >= 0.0:
@@ -126,7 +125,7 @@ class Cost:
         L = equations.reached()
         gradient = 2.0 * (weights.R @ F + plant.B.T @ P) @ L @ plant.C.T
         cost = float(np.trace(P))
-        # near the limit of stability rounding decides: a covariance cannot be negative
+        # near the stability limit rounding decides; a negative covariance gives it away
         if not (np.isfinite(cost) and np.trace(L) > 0.0 and np.diag(L).min() > -1e-9 * np.trace(L)):
             return None
         return CostPoint(K, cost, np.where(self.mask, gradient, 0.0), plant.C @ L @ plant.C.T)
@@ -134,13 +133,13 @@ class Cost:
     def scaled(self, point: CostPoint, gradient: FloatArray) -> FloatArray:
         """M⁻¹g with M the curvature of the cost at fixed P and L: 2 R_aa (C L C') on the free entries of every row a.
 
-        A step of −M⁻¹g is that of Anderson and Moore; M makes the descent independent of units and of how fast the
-        vehicles are.
+        −M⁻¹g is the step of Anderson and Moore; M makes the descent independent of units and of the vehicles' speed of
+        response.
         """
         direction = np.zeros_like(gradient)
         for rows, columns in self._row_groups:
             covariance = point.covariance[np.ix_(columns, columns)]
-            # outputs that never move, or hardly beside others, leave the covariance singular to rounding
+            # outputs that never move, or hardly move relative to others, leave the covariance singular to rounding
             values, vectors = np.linalg.eigh(covariance)
             values = values.clip(min=1e-13 * max(float(np.trace(covariance)), 1e-300))
             solved = gradient[np.ix_(rows, columns)] @ vectors / values @ vectors.T
@@ -149,10 +148,10 @@ class Cost:
 
 
 def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
-    """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
+    """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), from the Riccati equation.
 
-    Raises BadModelError if a weight is not what is wanted, and InfeasibleError if the Riccati equation has no
-    stabilising solution.
+    Raises BadModelError if a weight does not fit, and InfeasibleError if the Riccati equation has no stabilising
+    solution.
 
     >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
     >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1)))
@@ -164,7 +163,7 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
         P = linalg.solve_continuous_are(plant.A, plant.B, weights.Q, weights.R)
         K = -np.linalg.solve(weights.R, plant.B.T @ P)
         closed = plant.A + plant.B @ K
-        # a mode on the axis that Q does not weigh stays there, to rounding
+        # a mode on the axis without weight in Q stays there, to rounding
         if (slowest := float(np.linalg.eigvals(closed).real.max())) >= -_ROUNDING * np.linalg.norm(closed):
             raise np.linalg.LinAlgError(f"a root has the real part {slowest:.3g}")
     except np.linalg.LinAlgError as error:

@@ -1,8 +1,8 @@
-"""Gains for a station that predicts over the loop delay: the search of `for_delay` with other figures.
+"""Gains for a station that predicts over the loop delay: the search of `for_delay` with the figures of prediction.
 
-Prediction removes the delay from the loop without disturbances; how wrong the assumed delay may be then bounds the
-gains. They are asked for a window of true delays, as `Criteria.delays_s` with a `delay_rate` of 0, about the assumed
-one, `Criteria.at_delay_s`.
+Prediction removes the delay from the undisturbed loop, so the tolerated error of the assumed delay bounds the gains.
+The requirement is a window of true delays, `Criteria.delays_s` with a `delay_rate` of 0, around the assumed delay
+`Criteria.at_delay_s`.
 """
 
 from collections.abc import Sequence
@@ -23,25 +23,25 @@ from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
 
 _THINNED, _THINNED_PATTERN = 4, 10
-# gains that a search compares, at once and with a response
+# gains compared per search, without and with a response
 _EVALUATIONS, _EVALUATIONS_RESPONSE = 160, 400
-# mismatch for which a search begins where none is asked for, as a share of the assumed delay
+# mismatch assumed for the start of a search if none is required, as a share of the assumed delay
 _TOLERATED = 0.2
-# time scales from which gains on a pattern are started, as multiples of the assumed delay
+# time scales at which gains on a pattern start, as multiples of the assumed delay
 _SCALES = 0.2, 0.4, 0.8
-# how much more than is asked for the longest delay tolerates, as a share of it; and the least that is told from none
+# excess of the tolerance at the longest delay over the required one, relative; least tolerance distinguished from none
 _CLOSE, _NOTHING_S = 1e-6, 1e-9
 
 
 def least_gains(decay_rate_1_s: float, period_s: float) -> tuple[float, float]:
-    """Return the least (k1, k3) that decay at a rate if sampled and held without delay: a double root z = e^{-sigma T}.
+    """Return the least (k1, k3) with a decay rate, sampled and held without delay: a double root z = e^{-sigma T}.
 
     z^2 - (2 - k1 T - k3 T^2 / 2) z + 1 - k1 T + k3 T^2 / 2 has both roots within |z| <= p exactly if
 
         k1 T >= 1 - p^2 + k3 T^2 / 2   and   k3 T^2 / 2 >= (1 - p) (k1 T - 1 + p) / (1 + p),
 
-    and the double root meets both with the least k1 and the least k3. With prediction a loop decays like this at every
-    delay and the window is about 1 / (k1 + k3 tau^) to either side, so that no gains that decay as fast tolerate more.
+    and the double root meets both with the least k1 and the least k3. With prediction, a loop decays like this at every
+    delay and the window is about 1 / (k1 + k3 tau^) to either side, so no gains that decay as fast tolerate more.
     BadModelError if the rate or the period is not positive.
 
     >>> [round(gain, 3) for gain in least_gains(1.735, 0.02)]
@@ -54,9 +54,9 @@ def least_gains(decay_rate_1_s: float, period_s: float) -> tuple[float, float]:
 def longest_assumed_s(
     gains: ScalarGains, period_s: float, share: float, most_s: float, response: Response | None = None
 ) -> float:
-    """Return the longest loop delay (s), up to `most_s`, of which prediction with these gains tolerates a share.
+    """Return the longest assumed delay (s), up to `most_s`, at which prediction tolerates a relative error of `share`.
 
-    The loop is stable at every constant delay within this share of the assumed one. 0 if no delay is that long.
+    The loop is stable at every constant delay within this share of the assumed delay. 0 if not even at one period.
 
     >>> round(longest_assumed_s(ScalarGains(3.408, 0.631, 5.608, 0.0), 0.02, 0.05, 10.0), 2)
     1.6
@@ -76,13 +76,13 @@ def longest_assumed_s(
 def predicted_gains(
     wanted: Requirement, period_s: float, at_s: Sequence[float] | None = None, response: Response | None = None
 ) -> ScalarGains:
-    """Return the gains of the inclusion principle that meet a requirement with prediction and are best in its aim.
+    """Return the gains of the inclusion principle that meet a requirement with prediction and have the best objective.
 
-    `wanted.criteria` has the assumed delay. Figures at a delay are the worst at the true delays `at_s`, of the loop
-    without mismatch if None. Vehicles respond at once if they have no `response`. The α of the result is that at these
-    delays. Raises InfeasibleError as `searched` does.
+    `wanted.criteria.at_delay_s` is the assumed delay. Figures at a delay, and the α of the result, are the worst over
+    the true delays `at_s`; None means no mismatch. Without a `response`, vehicles respond at once. Raises
+    InfeasibleError as `searched` does.
 
-    With 20 % of mismatch to either side of 0.6 s, errors decay at 2.5 1/s; without prediction at 0.96 1/s at best:
+    With a mismatch of 20 % to either side of 0.6 s errors decay at 2.5 1/s, without prediction at 0.96 1/s at best:
 
     >>> from gains.core.requirement import Criteria, Requirement
     >>> criteria = Criteria(0.6, "decay_rate_at_delay_1_s", delays_s=(0.48, 0.72), delay_rate=0.0)
@@ -100,7 +100,7 @@ def predicted_gains(
 
 
 def _tolerated(criteria: Criteria) -> float:
-    """Half the width of the wanted window as a share of the assumed delay."""
+    """Half the width of the required window as a share of the assumed delay."""
     if criteria.delays_s is None or criteria.at_delay_s is None:
         return _TOLERATED
     return max(1e-3, (criteria.delays_s[1] - criteria.delays_s[0]) / 2.0 / criteria.at_delay_s)
@@ -108,7 +108,7 @@ def _tolerated(criteria: Criteria) -> float:
 
 @dataclass(frozen=True)
 class PredictedTree:
-    """k1, k2 and k3 of a vehicle behind another, as `TreeGains`, with prediction."""
+    """The gain family `TreeGains` (k1, k2 and k3 of a vehicle behind another) with prediction."""
 
     assumed_s: float
     period_s: float
@@ -125,7 +125,7 @@ class PredictedTree:
 
     @property
     def starts(self) -> Sequence[FloatArray]:
-        # a window of about 1 / (k1 + k3 tau^) to either side. A double root decays fastest; the largest alpha with a
+        # the window is about 1 / (k1 + k3 tau^) to either side; a double root decays fastest; the largest alpha with a
         # string peak of 1 is near k3 = 0.45 k1^2, k2 = 0.27 k1
         found: list[FloatArray] = []
         for share, front, ratio in ((0.9, 0.3, 0.25), (0.6, 0.3, 0.25), (0.3, 0.3, 0.25), (1.0, 0.27, 0.45)):
@@ -142,7 +142,7 @@ class PredictedTree:
 
 @dataclass(frozen=True, eq=False)
 class PredictedPattern:
-    """The free entries of K on a pattern, as `PatternGains`, with prediction over its delay."""
+    """The gain family `PatternGains` (free entries of K on a pattern) with prediction over its delay."""
 
     pattern: PatternGains
     step: float = 0.05

@@ -1,7 +1,7 @@
-"""Gains of the inclusion principle that meet a requirement, or which part of it to relax and how far.
+"""Gains of the inclusion principle that meet a requirement, or advice on which part to relax and how far.
 
-Every combination is one search of `gains.design.search`: what the requirement gives limits it, what it leaves open is
-made as large as possible.
+Every combination is one search of `gains.design.search`: the figures given in the requirement are its constraints, and
+the others are maximised.
 """
 
 from dataclasses import replace
@@ -16,18 +16,18 @@ from gains.performance.response import Response, sampled_margin
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.multirate import Timing
 
-# The search aims this much above the wanted margin, so that rounding cannot leave it below.
+# The search aims this much above the required margin to keep rounding from falling below it.
 _MARGIN_AIM_S = 2e-10
-# A margin is found to this share of itself; a decay rate for a message by this many bisections.
+# Relative accuracy of a margin; bisections for a decay rate in a message.
 _MARGIN_RESOLUTION, _DECAY_STEPS = 1e-9, 14
 
 
 def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
-    """Return the gains that meet the requirement and are the best in what it leaves open.
+    """Return the gains that meet the requirement and are otherwise best.
 
-    With a delay margin they have the largest α of all that meet the rest; without one the largest margin, and of those
-    the largest α. `period_s` is that of the control loop: sample, hold. InfeasibleError if no gains meet the
-    requirement, with what to relax and how far.
+    With a required delay margin, they have the largest α of all gains that meet the rest; without one, the largest
+    margin, and the largest α at that margin. `period_s` is the period of sampling and holding. InfeasibleError if no
+    gains meet the requirement, saying what to relax and how far.
     """
     gains = _best_gains(wanted, period_s)
     if gains is None:
@@ -51,7 +51,7 @@ def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
 
 
 def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: ChainLimit) -> float:
-    """The largest margin (s) with which gains decay as fast as this, 0 if none do; longer margins decay slower."""
+    """The largest margin (s) of gains that decay this fast, 0 if none do; decay slows as the margin grows."""
     low, high = 0.0, DELAY_MARGIN_MAX_S
     if fastest_decay(high, period_s, limit) >= decay_rate_1_s:
         return high
@@ -64,7 +64,7 @@ def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: ChainLimit) 
 
 
 def _conflict(wanted: Requirement, period_s: float) -> str:
-    """What cannot be had, and how far each part alone would have to be relaxed."""
+    """Message naming the parts in conflict, and how far each would have to be relaxed on its own."""
     given = [part for part in parts_of(wanted) if part.at_least]
     reached = [(part.name, rounded(_most(part.name, wanted, period_s), up=False)) for part in given]
     lower = [f"lower {name} to {most:g}" for name, most in reached if most > 0.0]
@@ -78,7 +78,7 @@ def _conflict(wanted: Requirement, period_s: float) -> str:
 
 
 def _most(name: str, wanted: Requirement, period_s: float) -> float:
-    """The largest value of one part of the requirement that leaves the others as they are; 0 if none does."""
+    """The largest value of one part of the requirement at which the other parts can be met; 0 if none."""
     limit, margin_s = wanted.chain_limit, wanted.delay_margin_s or 0.0
     alpha, decay = wanted.alpha or 0.0, wanted.decay_rate_1_s or 0.0
     if name == "alpha":
@@ -100,11 +100,11 @@ def _most(name: str, wanted: Requirement, period_s: float) -> float:
 def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
     """Return the requirement whose design has the wanted margin on vehicles with this response, at these periods.
 
-    The design assumes vehicles that respond at once and one period, the slower one, so it must ask for a longer margin.
-    False position finds how long. A requirement without a margin stays as it is. InfeasibleError if no gains have the
-    wanted margin with this response and these periods.
+    The design assumes vehicles that respond at once and a single period, the slower one, so its requirement must have a
+    longer margin, which false position finds. A requirement without a margin is returned unchanged. InfeasibleError if
+    no gains have the wanted margin with this response and these periods.
 
-    Without a delay margin there is nothing to find:
+    A requirement without a delay margin stays as it is:
 
     >>> wanted = Requirement(alpha=0.4)
     >>> requirement_with(wanted, Response(0.1, 0.0), timing=Timing(0.02, 0.02)) == wanted
@@ -122,12 +122,12 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
         found = largest_alpha(without_s, timing.held_s, requirement.chain_limit, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
-        if response is not None and response.dead_time_s and timing.commands == 1:  # which takes the other too long
+        if response is not None and response.dead_time_s and timing.commands == 1:  # sampled_margin is too slow here
             alone_s = (lone_margin(found.k1, k3, response, period_s=timing.held_s) for k3 in (0.0, found.k3))
             return min(alone_s) - wanted_s
         return sampled_margin(PAIR, found.K, responses, timing=timing) - wanted_s
 
-    # the response takes about its lag of the margin
+    # the response costs about its lag of the margin
     low, high = wanted_s, wanted_s + lag_s
     f_low, f_high = excess(low), excess(high)
     while f_high < 0.0 and high < DELAY_MARGIN_MAX_S:

@@ -1,4 +1,4 @@
-"""Gains of largest robustness by a linear matrix inequality, for one follower and for a centralised controller.
+"""Gains with the largest robustness by a linear matrix inequality, for one follower and a centralised controller.
 
 Sources: Sahoo 2012 (see `gains.formation.model`). Its LMI as printed has no solution: with a block-diagonal Y the
 (2, 2) block of A Y + Y A' + B L + L'B' is identically zero. `robust_lmi` solves it in sheared coordinates, which keep
@@ -18,8 +18,8 @@ from gains.formation.model import FormationModel
 from gains.formation.pattern import Plant
 from gains.performance.robust import disturbance_bound
 
-# Room for the solver's rounding: as slack asked of the inequality, and as a share when the bound it claims is compared
-# with the exact one.
+# Allowance for the solver's rounding: slack in the inequality, and relative tolerance when the claimed bound is
+# compared with the exact one.
 _ROUNDING = 1e-6
 
 
@@ -40,13 +40,13 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
         [[A_z Y + Y A_z' + B_z L + L'B_z' + T T', Y T^{-T}], [T^{-1} Y, −γ I]] ≺ 0,   ‖L‖ ≤ κ_L,   Y ⪰ I / κ_Y
         Y = diag(y1, y2, y1),   L = [[l1, 0, 0], [l2, l3, l1]],   A_z = T A T^{-1},   B_z = T B
 
-    One Schur complement less than the source: with its constant block −I kept, Clarabel often ends inaccurate. K = L
-    Y^{-1} T = [[k1, 0, 0], [k2, k3, k1]] has the wanted pattern, with the same k1 twice. Unbounded gains would reach
-    the supremum α = |c| / √(1 + c²); ‖K T^{-1}‖ is at most κ_L κ_Y. `shear` is c < 0 in 1/s, `gain_bound` κ_L and
-    `lyapunov_bound` κ_Y; BadModelError for other signs. SolverError if the solver does not end with status "optimal",
-    or the exact bound of K is below the one claimed.
+    This has one Schur complement less than the source: with its constant block −I, Clarabel often ends inaccurate.
+    K = L Y^{-1} T = [[k1, 0, 0], [k2, k3, k1]] has the wanted pattern, with the same k1 twice. Unbounded gains would
+    reach the supremum α = |c| / √(1 + c²); ‖K T^{-1}‖ is at most κ_L κ_Y. `shear` is c < 0 in 1/s, `gain_bound` is κ_L
+    and `lyapunov_bound` is κ_Y; BadModelError for other signs. SolverError if the solver does not end with status
+    "optimal", or if the exact bound of K is below the claimed one.
 
-    Near to the supremum 1 / √2 = 0.7071 of c = −1:
+    With c = −1, α is close to the supremum 1 / √2 = 0.7071:
 
     >>> found = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0)
     >>> round(found.alpha, 3)
@@ -65,12 +65,12 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
 
 
 def centralised_lmi(plant: Plant, *, gain_bound: float, lyapunov_bound: float) -> RobustGain:
-    """Return the K of largest sector bound α (W = I) that one full Lyapunov matrix proves: every vehicle knows all.
+    """Return the K with the largest sector bound α (W = I) that a full Lyapunov matrix proves, using all states.
 
-    The inequality is that of `robust_lmi` with T = I and full Y and L, and so are arguments and exceptions; ‖K‖ is at
+    The inequality is that of `robust_lmi` with T = I and full Y and L; arguments and exceptions are the same. ‖K‖ is at
     most κ_L κ_Y.
 
-    x' = u + w: L = −2 and Y = 1/2 give K = −4 and γ = Y² / (−2 L − 1) = 1/12.
+    For x' = u + w, L = −2 and Y = 1/2 give K = −4 and γ = Y² / (−2 L − 1) = 1/12:
 
     >>> found = centralised_lmi(Plant([[0]], [[1]]), gain_bound=2.0, lyapunov_bound=2.0)
     >>> found.K.round(3).tolist(), round(found.alpha, 3)
@@ -87,7 +87,7 @@ def centralised_lmi(plant: Plant, *, gain_bound: float, lyapunov_bound: float) -
 def _largest_alpha(
     A: FloatArray, B: FloatArray, T: FloatArray, Y: Any, L: Any, *, bounds: tuple[float, float], advice: str
 ) -> RobustGain:
-    """Solve the inequality of `robust_lmi` for unknowns Y and L with a structure, and check its α."""
+    """Solve the inequality of `robust_lmi` for structured unknowns Y and L, and check its α."""
     import cvxpy as cp
 
     for name, bound in zip(("gain_bound", "lyapunov_bound"), bounds, strict=True):

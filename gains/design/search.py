@@ -1,8 +1,8 @@
 """The exact trade-off between robustness, delay margin and decay rate of one follower, as a two-dimensional search.
 
-The search runs along the curve of all (k1, k3) of a margin (`gains.performance.scalar_gains`) and over k2. Nothing in
-it is random, and no frequency grid decides a margin. `gains.design.design` checks what it finds with methods that share
-no formula with it.
+The search runs along the curve of all (k1, k3) with a given margin (`gains.performance.scalar_gains`) and over k2. It
+is deterministic, and no frequency grid decides a margin. `gains.design.design` checks its results with methods that
+share no formula with it.
 """
 
 import numpy as np
@@ -19,37 +19,37 @@ from gains.performance.scalar_gains import (
     onboard_front_gain_limit,
 )
 
-# Points along the curve and over k2 in the first scan and in later ones, and over the spare margin. A round halves the
-# window; 18 leave 1e-5 of it (1e-4 of that of k2, five rounds behind), and α, flat at its maximum, is exact to 1e-9.
+# Points along the curve and over k2 in the first scan and in later ones; points over the spare margin. A round halves
+# the window: 18 leave 1e-5 of it (1e-4 for k2, five rounds behind), and α, flat at its maximum, is exact to 1e-9.
 _ROUNDS_ALL_FRONT = 5
 _SCAN_FIRST, _SCAN_NEXT, _SCAN_SPARE, _ROUNDS = (25, 17), (9, 9), 9, 18
-# The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop; above 1 in the sampled loop.
+# Range of the crossing angle, as a share of the angle at which k3 = 0 in the continuous loop; it exceeds 1 if sampled.
 _SHARE_MIN, _SHARE_MAX = 0.02, 1.3
-# |k2| is sought up to this multiple of k1. The optimum of α is near k1. A range of k2 that is empty by this share of k1
-# is a point, as with full feed-forward.
+# |k2| is searched up to this multiple of k1; the optimum of α is near k1. A range of k2 whose ends cross by at most
+# this share of k1 is a single point, as with full feed-forward.
 _FRONT_MAX, _SLIVER = 2.0, 1e-9
-# k1 T at most: without delay the sampled leader moves by the factor 1 − k1 T a period, which this keeps above −0.8.
+# Limit on k1 T: without delay the sampled leader's error changes by 1 − k1 T per period, kept above −0.8 by this.
 _OWN_STEP_MAX = 1.8
-# α is exact to about this, so an α asked for is aimed at from above by it, and no finer root is sought.
+# Accuracy of α. The search aims above a required α by this, and seeks no finer root.
 _ALPHA_RESOLUTION = 1e-9
-# Few of the high gains of a margin that is short against the period are usable, and a longer one may have a larger α:
-# up to the first number of periods, margins longer by up to the second are searched too.
+# If the margin is short relative to the period, few of its high gains are usable, and a longer margin may have a larger
+# α. Up to the first number of periods, margins longer by up to the second are therefore searched too.
 _SHORT_MARGIN, _SPARE_MAX = 2.0, 2.0
-# Where the search for a margin begins, and where it ends: α is then below 1e-4, which is of no use.
+# The search for a margin begins at the first and ends at the second, where α is below 1e-4 and useless.
 _MARGIN_FIRST_S, _MARGIN_MAX_S = 0.3, 75.0
-# Points along the curve in the search for the fastest decay, and rounds that keep ±1 cell: 1e-13 of the curve is left.
+# Points along the curve in the search for the fastest decay; rounds, each keeping ±1 cell, to 1e-13 of the curve.
 _SCAN_FASTEST, _ROUNDS_FASTEST = 33, 12
 
 
 def largest_alpha(
     delay_margin_s: float, period_s: float, limit: ChainLimit = UNLIMITED, decay_rate_1_s: float = 0.0
 ) -> ScalarGains | None:
-    """Return the gains of largest α among those with at least the given delay margin, None if there are none.
+    """Return the gains with the largest α among those with at least the given delay margin, None if there are none.
 
     The margin is that of the loop with all feedback late, sampled and held every `period_s`, or continuous if that is
-    0. Spacing errors grow from vehicle to vehicle by no more than `limit` says, both without delay and with half the
-    margin as loop delay (plus half a period for the hold), or on board at every delay. The continuous loop without
-    delay decays at least with `decay_rate_1_s`. α is that of the loop with the feed-forward in `limit`.
+    0. Spacing errors grow from vehicle to vehicle by at most `limit`, both without delay and with half the margin as
+    loop delay (plus half a period for the hold), or on board at every delay. The continuous loop without delay decays
+    at least at `decay_rate_1_s`. α is that of the loop with the feed-forward in `limit`.
     """
     # Axes of the scan: share of the crossing angle, k2 as a share of its limit, margin left over in periods.
     shares = (_SHARE_MIN, _SHARE_MAX)
@@ -73,7 +73,7 @@ def largest_alpha(
             _narrowed(window, centre, count, ends)
             for window, centre, count, ends in zip(windows, best[1], points, bounds, strict=True)
         ]
-        # High gains make α nearly the same for every k2, and the best k2 of a coarse scan of the rest means nothing.
+        # High gains make α nearly independent of k2, so the best k2 of a scan that is coarse in the rest means nothing.
         windows = (narrowed[0], narrowed[1] if turn >= _ROUNDS_ALL_FRONT else bounds[1], narrowed[2])
     assert best is not None
     return best[0]
@@ -82,7 +82,7 @@ def largest_alpha(
 def largest_margin(
     alpha: float, period_s: float, limit: ChainLimit = UNLIMITED, decay_rate_1_s: float = 0.0
 ) -> tuple[float, ScalarGains] | None:
-    """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
+    """Return the largest delay margin (s) at which α can be reached, and the gains; None if there is none.
 
     The largest α falls as the margin grows; this is the inverse, by false position.
     """
@@ -91,7 +91,7 @@ def largest_margin(
         gains = largest_alpha(margin_s, period_s, limit, decay_rate_1_s)
         return (gains.alpha if gains else 0.0) - alpha - _ALPHA_RESOLUTION
 
-    # Double the margin until α is lost, or halve it until α is there; below two periods the last half is all of it.
+    # Double the margin until α is lost, or halve it until α is reached; below two periods, try 0 next.
     low, high = 0.0, _MARGIN_FIRST_S
     f_low, f_high = -1.0, excess(high)
     while f_high >= 0 and high < _MARGIN_MAX_S:
@@ -113,15 +113,15 @@ def largest_margin(
 def fastest_decay(delay_margin_s: float, period_s: float, limit: ChainLimit = UNLIMITED) -> float:
     """Return the largest decay rate (1/s), without delay, of gains with a margin; 0 if no gains have the margin.
 
-    Arguments as of `largest_alpha`.
+    Arguments as for `largest_alpha`.
     """
     return _fastest(delay_margin_s, period_s, limit)[0]
 
 
 def _fastest(delay_margin_s: float, period_s: float, limit: ChainLimit) -> tuple[float, float]:
-    """The largest decay rate of a margin and the share of the crossing angle that has it.
+    """The largest decay rate at a margin and the share of the crossing angle at which it occurs.
 
-    Along the curve the decay rate rises to that share, critical damping or the last that is usable, and falls.
+    Along the curve the decay rate rises to that share (critical damping, or the last usable share) and then falls.
     """
     low, high = _SHARE_MIN, _SHARE_MAX
     rate, share = 0.0, (low + high) / 2
@@ -137,13 +137,13 @@ def _fastest(delay_margin_s: float, period_s: float, limit: ChainLimit) -> tuple
 def _fast_shares(
     decay_rate_1_s: float, delay_margin_s: float, period_s: float, limit: ChainLimit
 ) -> tuple[float, float] | None:
-    """The shares of the crossing angle between which gains of a margin decay as fast as this; None if none do."""
+    """Range of shares of the crossing angle in which gains with a margin decay this fast; None if none do."""
     rate, share = _fastest(delay_margin_s, period_s, limit)
     if rate < decay_rate_1_s:
         return None
 
     def last_fast(end: float) -> float:
-        """The last share from the fastest one towards an end that is fast enough."""
+        """The last share that is fast enough, going from the fastest one towards an end."""
         fast, slow = share, end
         for _ in range(_ROUNDS_FASTEST):
             shares = np.linspace(fast, slow, _SCAN_FASTEST)
@@ -156,7 +156,7 @@ def _fast_shares(
 
 
 def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, limit: ChainLimit) -> FloatArray:
-    """The decay rate at each share, the largest over the margin to spare; 0 where no gains can be used."""
+    """The decay rate at each share, maximised over the spare margin; 0 where no gains are usable."""
     spare_max = _spare_max(delay_margin_s, period_s)
     spare = np.linspace(0.0, spare_max, _SCAN_SPARE if spare_max else 1)[:, None]
     k1, k3, _, most = _usable_gains(share, delay_margin_s + spare * period_s, period_s, limit)
@@ -164,14 +164,14 @@ def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, limi
 
 
 def _spare_max(delay_margin_s: float, period_s: float) -> float:
-    """How far beyond the wanted margin is searched, in periods."""
+    """How far beyond the wanted margin to search, in periods."""
     return _SPARE_MAX if delay_margin_s <= _SHORT_MARGIN * period_s else 0.0
 
 
 def _usable_gains(
     share: FloatArray, margin_s: FloatArray, period_s: float, limit: ChainLimit
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """k1, k3 of each share and margin (broadcast), and the least and the largest k2; NaN where they cannot be used."""
+    """k1 and k3 at each share and margin (broadcast), and the least and largest k2, NaN where they are not usable."""
     share, margin_s = np.broadcast_arrays(share, margin_s)
     k1, k3 = gains_of_margin(share, margin_s, period_s)
     least, most = _front_range(k1, k3, (margin_s + period_s) / 2, limit)
@@ -182,7 +182,7 @@ def _usable_gains(
 def _best_of_grid(
     grids: list[FloatArray], delay_margin_s: float, period_s: float, limit: ChainLimit, decay_rate_1_s: float
 ) -> tuple[ScalarGains, tuple[float, float, float]] | None:
-    """The gains of largest α on the grids of share, front and spare, and where they are; None if none can be used."""
+    """The gains with the largest α on the grids of share, front and spare, and their place; None if none is usable."""
     front = grids[1]
     share, spare = (grid.ravel() for grid in np.meshgrid(grids[0], grids[2]))
     k1, k3, least, most = _usable_gains(share, delay_margin_s + spare * period_s, period_s, limit)
@@ -202,9 +202,9 @@ def _best_of_grid(
 def _front_range(
     k1: FloatArray, k3: FloatArray, delay_s: FloatArray, limit: ChainLimit
 ) -> tuple[FloatArray, FloatArray]:
-    """The least and the largest k2 to try: a multiple of k1, less where spacing errors would grow.
+    """The least and the largest k2 to try: multiples of k1, reduced where spacing errors would grow beyond the limit.
 
-    Where they grow in any case, the least is above the largest, or both are NaN.
+    Where they do at every k2, the least is above the largest, or both are NaN.
     """
     least, most = -_FRONT_MAX * k1, _FRONT_MAX * k1
     if limit.peak is None:

@@ -1,8 +1,8 @@
 """Linear quadratic gains with a given information pattern, to first-order optimality.
 
 The gradient of the cost J(K) of `gains.design.lqr` is exact and is projected on the pattern. J grows without bound
-towards the border of the stabilising gains, so a descent never leaves them. It finds a local minimum; the centralised
-optimum, with all states for every input, bounds how much better any other could be.
+towards the boundary of the stabilising gains, so a descent never leaves them. It finds a local minimum; the centralised
+optimum, in which every input uses all states, bounds how much better any other gain could be.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
 """
@@ -18,20 +18,20 @@ from gains.core.errors import InfeasibleError, SolverError
 from gains.design.lqr import Cost, CostPoint, Weights, centralised_lqr
 from gains.formation.pattern import Pattern, Plant, check_fits
 
-# The decrement g'M⁻¹g / J estimates the share of the cost that is still to be gained. Costs are known to about 1e-13.
+# The decrement g'M⁻¹g / J estimates the remaining reduction of the cost, relative. Costs are known to about 1e-13.
 _DECREMENT = 1e-13
-# above this a failed line search is an error; below, rounding has stopped it
+# a line search that fails above this decrement is an error; below it, rounding has stopped the search
 _DECREMENT_ACCEPTED = 1e-9
 _ITERATIONS = 2000
 _MEMORY = 20
 _LINE_STEPS = 50
 _HOMOTOPY_ROUNDS = 200
-# share of the way to the border of stability that the homotopy keeps as distance
+# share of the distance to the stability boundary that the homotopy keeps
 _HOMOTOPY_DISTANCE = 0.1
-# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises but the
+# random starts for the descent of the abscissa; of the three-vehicle patterns that a static gain stabilises but the
 # homotopy does not, the hardest takes 22
 _ABSCISSA_STARTS = 60
-# share of the norm of A: a negative abscissa nearer to zero may be the rounding of a defective eigenvalue
+# share of the norm of A; a negative abscissa closer to zero may be rounding of a defective eigenvalue
 _CLEARLY_STABLE = 1e-4
 
 
@@ -39,7 +39,7 @@ _CLEARLY_STABLE = 1e-4
 class StructuredLqr:
     """A gain with the pattern at which the cost is stationary, and lower than at the start.
 
-    `cost` is J(K) and `cost_centralised` the least of all gains on the full state, a lower bound of J.
+    `cost` is J(K); `cost_centralised` is the least cost of any gain on the full state, a lower bound on J.
     """
 
     K: FloatArray
@@ -48,16 +48,16 @@ class StructuredLqr:
 
     @property
     def loss(self) -> float:
-        """Share by which the cost is above the centralised one: 0.1 is 10 %."""
+        """Relative excess of the cost over the centralised one: 0.1 is 10 %."""
         return self.cost / self.cost_centralised - 1.0
 
 
 def structured_lqr(plant: Plant, pattern: Pattern, weights: Weights) -> StructuredLqr:
     """Return a gain with the pattern at which the quadratic cost has a local minimum.
 
-    The descent starts from `stabilising_gain`. 50 vehicles of one axis (99 states) take a few seconds. Raises
+    The descent starts from `stabilising_gain`. 50 vehicles on one axis (99 states) take a few seconds. Raises
     BadModelError if sizes do not fit, InfeasibleError if no stabilising gain is found, and SolverError if the descent
-    ends where the cost is not stationary.
+    ends at a point where the cost is not stationary.
     """
     start = stabilising_gain(plant, pattern, weights)
     cost = Cost(plant, pattern.mask, weights)
@@ -77,12 +77,12 @@ def structured_lqr(plant: Plant, pattern: Pattern, weights: Weights) -> Structur
 
 
 def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatArray:
-    """Return a gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
+    """Return a stabilising gain with the pattern, found from K = 0 by a homotopy, or from random gains.
 
-    A − σI is stable for large σ. A few descent steps on its cost give a gain that stabilises a smaller σ too; σ is then
-    lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer only each
+    A − σI is stable for large σ. A few descent steps on its cost give a gain that also stabilises a smaller σ; σ is
+    then lowered almost that far, until it is 0. If that ends at σ > 0, as in patterns in which vehicles steer only each
     other, the real part of the rightmost eigenvalue itself is lowered, from seeded random gains. InfeasibleError if no
-    gain is found: whether any static gain stabilises is NP-hard to decide, so there may be one all the same, but not if
+    gain is found. Deciding whether a static gain stabilises is NP-hard, so one may still exist, but not if
     `gains.formation.fixed_modes` finds an unstable mode.
     """
     check_fits(plant, pattern)
@@ -114,10 +114,10 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
 
 
 def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray, float]:
-    """The first gain that stabilises by more than rounding, or else the best, with the largest real part (1/s) left.
+    """The first gain that stabilises by more than rounding, otherwise the best, with its abscissa (1/s).
 
-    Quasi-Newton descent of the abscissa, whose derivative for an eigenvalue with left and right vectors w, v is
-    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima, hence many starts.
+    The abscissa is lowered by quasi-Newton descent. Its derivative for an eigenvalue with left and right vectors w, v
+    is Re w B dK C v / w v. It is not smooth where eigenvalues meet and has many local minima, hence many starts.
     """
     from scipy import optimize
 
@@ -151,7 +151,7 @@ def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray,
 
 
 def _descend(cost: Cost, point: CostPoint, most: int, tolerance: float) -> tuple[CostPoint, float, int]:
-    """Quasi-Newton descent (L-BFGS) in the metric M; the last point, its decrement and the number of iterations."""
+    """Quasi-Newton descent (L-BFGS) in the metric M: returns the last point, its decrement, the iteration count."""
     steps: list[tuple[FloatArray, FloatArray]] = []
     iterations = 0
     while True:
@@ -191,7 +191,7 @@ def _quasi_newton(
 
 
 def _line_search(cost: Cost, point: CostPoint, direction: FloatArray) -> CostPoint | None:
-    """A stabilising point on the ray that meets the weak Wolfe conditions, by bisection; None if rounding hides it."""
+    """A stabilising point on the ray that meets the weak Wolfe conditions, by bisection; None if rounding prevents."""
     slope = float(np.sum(point.gradient * direction))
     low, high, length = 0.0, np.inf, 1.0
     best: CostPoint | None = None

@@ -1,11 +1,11 @@
-"""Bring a gain on any pattern to a requirement by a change of the time scale, which keeps the pattern.
+"""Scaling of a gain on any pattern to a requirement by a change of time scale, which keeps the pattern.
 
-With velocity gains K_v / s and spacing gains K_p / s² a loop of double integrators does the same things s times slower:
-its continuous delay margin is s times larger and its decay rate s times smaller, exactly. A few steps of a fixed-point
-iteration on s find the margin of the sampled loop, about half a period less.
+With velocity gains K_v / s and spacing gains K_p / s² a loop of double integrators makes the same motion s times
+slower: its continuous delay margin is s times larger and its decay rate s times smaller, exactly. A few steps of a
+fixed-point iteration on s meet the margin of the sampled loop, which is about half a period less.
 
-On board only the errors of other vehicles are late, and a pattern without cycles takes every delay, so that gains could
-rise without bound. So the vehicles' own gains must have the margin too, as if a ground station closed their loops.
+On board only the errors of other vehicles are late, and a pattern without cycles tolerates every delay, so gains could
+rise without bound. The vehicles' own gains must therefore have the margin too, as if a station closed their loops.
 """
 
 from collections.abc import Sequence
@@ -23,20 +23,20 @@ from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 
-# The margin is met with at most this much to spare, as a share of it.
+# The margin is exceeded by at most this share of it.
 _SPARE = 1e-6
 _SCALING_STEPS, _BISECTIONS = 20, 40
-# Time scales looked at when only robustness or decay are asked for.
+# Time scales tried if only robustness or decay are required.
 _SCALES = np.geomspace(1e-3, 1e3, 121).tolist()
-# The figures of a requirement that a time scale trades for the margin.
+# The required figures that a time scale trades for the margin.
 _FIGURES = "alpha", "decay_rate_1_s"
 
 
 @dataclass(frozen=True, eq=False)
 class BaseGain:
-    """A stabilising gain for one axis, in a time scale of its own, and how it was found.
+    """A stabilising gain for one axis, before scaling of time, and how it was found.
 
-    `margin_s` is the continuous margin that a requirement bounds, `cost_loss` and `solver` are as in
+    `margin_s` is the continuous margin that a requirement bounds; `cost_loss` and `solver` are as in
     `gains.design.graph.GraphDesign`.
     """
 
@@ -49,7 +49,7 @@ class BaseGain:
 
 @dataclass(frozen=True)
 class BoundedMargins:
-    """The margins of a gain for one axis that a requirement bounds, by where the loop is closed."""
+    """The margins, of a gain for one axis, that a requirement bounds; they depend on where the loop is closed."""
 
     model: FormationModel
     period_s: float
@@ -71,9 +71,9 @@ class BoundedMargins:
 
 
 def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> FloatArray:
-    """Return the gain with which the loop does the same `scale` times slower: K_v / scale, K_p / scale².
+    """Return the gain with which the loop makes the same motion `scale` times slower: K_v / scale, K_p / scale².
 
-    K is of shape (any, states): K_v are its columns of velocity errors, K_p those of spacing errors.
+    K has the shape (any, states): K_v are its columns for velocity errors, K_p those for spacing errors.
 
     >>> time_scaled(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]), 2.0).tolist()
     [[-0.5, 0.0, 0.0], [0.0, 0.25, -0.5]]
@@ -84,16 +84,16 @@ def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> Float
 
 
 def scaled_to(wanted: Requirement, margins: BoundedMargins, bases: Sequence[BaseGain]) -> tuple[BaseGain, FloatArray]:
-    """Return the best base and its gain in the time scale that meets the requirement.
+    """Return the best base and its gain, scaled to meet the requirement.
 
-    InfeasibleError if no time scale of any base does; the message says what can be reached.
+    InfeasibleError if no time scale of any base meets it; the message says what can be reached.
     """
     base, scale = (_slowest if wanted.delay_margin_s is None else _at_margin)(wanted, margins, bases)
     return base, time_scaled(margins.model, base.K, scale)
 
 
 def _at_margin(wanted: Requirement, margins: BoundedMargins, bases: Sequence[BaseGain]) -> tuple[BaseGain, float]:
-    """The most robust base that meets everything else, brought to the wanted margin."""
+    """The most robust base that meets the rest of the requirement, and the scale that gives it the wanted margin."""
     margin_s, period_s = wanted.delay_margin_s, margins.period_s
     assert margin_s is not None
     # exact but for terms in the square of the period
@@ -119,7 +119,7 @@ def _at_margin(wanted: Requirement, margins: BoundedMargins, bases: Sequence[Bas
 
 
 def _slowest(wanted: Requirement, margins: BoundedMargins, bases: Sequence[BaseGain]) -> tuple[BaseGain, float]:
-    """The base and time scale of largest margin that reach the wanted robustness and decay rate."""
+    """The base and time scale with the largest margin that reach the wanted robustness and decay rate."""
     fitting = [(base, scale) for base in bases if (scale := _slowest_scale(wanted, margins, base)) is not None]
     if fitting:
         base, scale = max(fitting, key=lambda each: each[0].margin_s * each[1])
@@ -147,7 +147,7 @@ def _slowest_scale(wanted: Requirement, margins: BoundedMargins, base: BaseGain)
 
 
 def _figures(margins: BoundedMargins, base: BaseGain, scale: float) -> tuple[float, float]:
-    """α of the whole formation and decay rate (1/s) of a base in a time scale."""
+    """α of the whole formation and decay rate (1/s) of a base at a time scale."""
     model = margins.model
     closed_loop = model.A + model.B @ time_scaled(model, base.K, scale)
     return disturbance_bound(closed_loop, np.eye(model.states)), base.decay_rate_1_s / scale
@@ -158,7 +158,7 @@ def _meets(figures: tuple[float, float], wanted: Requirement) -> bool:
 
 
 def _short_of(wanted: Requirement, reached: Sequence[tuple[float, float]]) -> tuple[str, str]:
-    """What was asked for, and the most that was reached of each."""
+    """Text of the required figures, and text of the most that was reached of each."""
     asked = [
         (name, most) for name, most in zip(_FIGURES, np.max(reached, axis=0), strict=True) if getattr(wanted, name)
     ]

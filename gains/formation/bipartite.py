@@ -1,9 +1,9 @@
-"""A gain with an information pattern as a block-diagonal gain, one block for each complete bipartite subgraph.
+"""Block-diagonal form of a gain with an information pattern, one block for each complete bipartite subgraph.
 
 The links of a pattern are the edges of a bipartite graph of inputs and outputs. A partition of the edges into complete
 bipartite subgraphs (bicliques) expands the gain: K = φ1 K̄ φ2, where K̄ has one diagonal block for each subgraph and
 the 0/1 matrices φ1, φ2 repeat inputs and outputs. The plant with B̄ = B φ1 and C̄ = φ2 C has the same closed loop. The
-partition is not unique: the one by inputs has φ1 = I; to find the smallest one is NP-hard in general.
+partition is not unique: the one by inputs has φ1 = I; finding the smallest one is NP-hard in general.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eqs. (4.3), (4.4), (4.6), (4.7).
 """
@@ -18,9 +18,9 @@ from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.formation.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
 
-# All partitions are tried for patterns with at most this many links, equal rows and columns counted once,
+# exhaustive search is limited to patterns with this many links, equal rows and columns counted once,
 LARGEST_SEARCH_LINKS = 40
-# and for at most this many steps, some seconds. After that the best partition is not known to be the smallest.
+# and to this many steps (some seconds); beyond them the best partition found is not known to be the smallest
 _SEARCH_STEPS = 200_000
 
 
@@ -39,9 +39,9 @@ class Subgraph:
 
 @dataclass(frozen=True)
 class Partition:
-    """Subgraphs, sorted by their first link, that hold every link of a pattern exactly once.
+    """Subgraphs, sorted by their first link, that together hold every link of a pattern exactly once.
 
-    No partition has fewer than `lower_bound` subgraphs.
+    `lower_bound` is a lower bound on the number of subgraphs in any partition.
     """
 
     subgraphs: tuple[Subgraph, ...]
@@ -77,7 +77,7 @@ class ExpandedGain:
 
 
 def partition_by_input(pattern: Pattern) -> Partition:
-    """One subgraph for each input and the outputs it uses: φ1 = I if every input uses some.
+    """The partition with one subgraph for each input and the outputs it uses: φ1 = I if every input uses some.
 
     The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
 
@@ -90,11 +90,11 @@ def partition_by_input(pattern: Pattern) -> Partition:
 
 
 def smallest_partition(pattern: Pattern) -> Partition:
-    """The partition with the fewest subgraphs, or the best that was found: see `Partition.smallest`.
+    """The partition with the fewest subgraphs, or the best one found: see `Partition.smallest`.
 
-    The best of three heuristics (by input, by output, largest first) is the smallest if it meets the rank of the
-    pattern, which bounds all partitions from below (Graham and Pollak). If not, all smaller partitions are tried, up to
-    `LARGEST_SEARCH_LINKS` links between different rows and columns and within a fixed number of steps.
+    The best of three heuristics (by input, by output, largest first) is the smallest if its size equals the rank of the
+    pattern, a lower bound on all partitions (Graham and Pollak). Otherwise all smaller partitions are tried, up to
+    `LARGEST_SEARCH_LINKS` links between distinct rows and columns and within a fixed number of steps.
     """
     row_class, column_class = _classes(pattern.blocks), _classes(pattern.blocks.T)
     core = pattern.blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
@@ -122,7 +122,7 @@ def smallest_partition(pattern: Pattern) -> Partition:
 def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     """φ1, φ2 and the mask of a partition; BadModelError if it does not hold every link of the pattern exactly once.
 
-    The sizes of (4.7), and φ1 = I:
+    This partition has the sizes of (4.7), and φ1 = I:
 
     >>> from gains import FormationModel
     >>> from gains.formation.pattern import leader_follower
@@ -141,10 +141,10 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
 
 
 def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> float:
-    """Largest difference of the closed loops A + B K C and A + B̄ K̄ C̄, relative to the largest entry of the latter.
+    """Largest difference between the closed loops A + B K C and A + B̄ K̄ C̄, relative to the latter's largest entry.
 
     K has the shape (inputs, outputs). Raises BadModelError if it does not have the pattern or the plant does not fit,
-    and DisagreementError if the difference is more than rounding.
+    and DisagreementError if the difference exceeds rounding (1e-12).
 
     >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
     >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
@@ -175,7 +175,7 @@ def _check_partition(pattern: Pattern, partition: Partition) -> None:
 
 
 def _stacked(vehicles: list[int], sizes: tuple[int, ...]) -> FloatArray:
-    """0/1 matrix that stacks these vehicles' parts of a vector, in the order given."""
+    """0/1 matrix that stacks the parts of a vector that belong to these vehicles, in the order given."""
     starts = np.concatenate([[0], np.cumsum(sizes)])
     index = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in vehicles] or [np.zeros(0, dtype=np.intp)])
     return np.eye(int(starts[-1]))[index.astype(np.intp)]
@@ -186,7 +186,7 @@ def _rank_bound(blocks: BoolArray) -> int:
 
 
 def _classes(rows: BoolArray) -> list[list[int]]:
-    """Indices of the rows that are not empty, equal ones together."""
+    """Indices of the nonempty rows, grouped by equality."""
     found: dict[bytes, list[int]] = {}
     for k in np.flatnonzero(rows.any(axis=1)).tolist():
         found.setdefault(rows[k].tobytes(), []).append(k)
@@ -198,7 +198,7 @@ def _rows(blocks: BoolArray) -> list[Subgraph]:
 
 
 def _largest_first(core: BoolArray) -> list[Subgraph]:
-    """Greedy partition: again and again the largest subgraph on the common outputs of one or two inputs."""
+    """Greedy partition: repeatedly takes the largest subgraph on the common outputs of one or two inputs."""
     left = core.copy()
     graphs: list[Subgraph] = []
     while left.any():
@@ -214,10 +214,10 @@ def _largest_first(core: BoolArray) -> list[Subgraph]:
 
 
 def _search(core: BoolArray, count: int, steps: Iterator[int]) -> tuple[list[Subgraph] | None, bool]:
-    """A partition into at most `count` subgraphs if there is one, and whether the steps were enough to know.
+    """A partition into at most `count` subgraphs, None if none was found, and whether the steps sufficed to decide.
 
-    The first uncovered link joins one of the open subgraphs, with the further links that complete it, or opens a new
-    one. Subgraphs are opened in the order of their first links, so that no partition is tried twice.
+    The first uncovered link joins an open subgraph, together with the links that then complete it, or opens a new
+    one. Subgraphs are opened in the order of their first links, so no partition is tried twice.
     """
     links = [(int(i), int(j)) for i, j in np.argwhere(core)]
     allowed: list[list[bool]] = core.tolist()

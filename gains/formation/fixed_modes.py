@@ -2,8 +2,8 @@
 
 λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
 pattern. If it lies in the closed right half plane, no such gain stabilises the plant. A mode that random gains do not
-move is fixed: the gains that leave a free one where it is have measure zero. Each strongly connected component of plant
-and pattern is looked at by itself.
+move is fixed, because the gains that leave a free mode in place have measure zero. Each strongly connected component of
+plant and pattern is analysed on its own.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
 is a station.
@@ -18,9 +18,9 @@ from gains.core.errors import InfeasibleError
 from gains.core.structure import distinct_blocks, strongly_connected_blocks
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
 
-# singular values below this share of the largest are zero: rounding is 1e-15, and what a gain moves is far larger
+# singular values below this share of the largest are zero: rounding is 1e-15, and the effect of a gain is far larger
 _RANK_TOLERANCE = 1e-10
-# eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
+# eigenvalues of A within this share of its norm are one defective eigenvalue; their mean is exact to rounding
 _SAME_EIGENVALUE = 1e-5
 _RANDOM_GAINS = 3
 
@@ -30,26 +30,26 @@ class FixedMode:
     """An eigenvalue of A + B K C that is the same for every K with the pattern."""
 
     mode: complex
-    """λ, 1/s; of a complex pair the one with positive imaginary part."""
+    """λ, 1/s; of a complex pair, the one with positive imaginary part."""
     states: tuple[int, ...]
     """Indices of the states of the components in which λ is fixed."""
     remedies: tuple[tuple[Link, ...], ...]
-    """Sets of links each of which, added to the pattern, frees the mode; empty if λ is not controllable or not
-    observable even with all inputs and outputs."""
+    """Alternative sets of links; adding any one set to the pattern frees the mode. Empty if λ is uncontrollable or
+    unobservable even with all inputs and outputs."""
 
     @property
     def unstable(self) -> bool:
-        """Whether λ is in the closed right half plane, 1e-9 of rounding included."""
+        """Whether λ is in the closed right half plane, with a tolerance of 1e-9 for rounding."""
         return self.mode.real > -1e-9 * max(1.0, abs(self.mode))
 
 
 def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
     """Every mode that no gain with the pattern moves, in ascending order of real part.
 
-    The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` is that
-    of the random gains. Raises BadModelError if plant and pattern do not fit.
+    The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` seeds the
+    random gains. Raises BadModelError if plant and pattern do not fit.
 
-    A leader that may not use its own velocity error keeps its integrator, unless a link is added:
+    The integrator of a leader that may not use its own velocity error is fixed, unless a link is added:
 
     >>> from gains import FormationModel
     >>> from gains.formation.pattern import formation_plant, leader_follower
@@ -78,8 +78,8 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
 def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
     """The fixed modes, if all of them are stable.
 
-    A dynamic controller with the pattern then stabilises the plant; a static gain need not exist. Arguments and further
-    exceptions as of `fixed_modes`. InfeasibleError if a fixed mode is unstable; the message names the links to add.
+    A dynamic controller with the pattern then stabilises the plant; a static gain need not exist. Raises
+    InfeasibleError if a fixed mode is unstable; the message names the links to add. Otherwise as `fixed_modes`.
     """
     modes = fixed_modes(plant, pattern, seed=seed)
     unstable = [mode for mode in modes if mode.unstable]
@@ -93,7 +93,7 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
 
 
 def distinct_modes(A: FloatArray) -> list[complex]:
-    """The distinct eigenvalues (1/s) of A (n, n), one of each complex pair; those closer than rounding once.
+    """The distinct eigenvalues (1/s) of A (n, n), one of each complex pair; those equal to rounding are merged.
 
     >>> distinct_modes(np.diag([-1.0, -1.0, -2.0]))
     [(-1+0j), (-2+0j)]
@@ -113,23 +113,23 @@ def distinct_modes(A: FloatArray) -> list[complex]:
 
 
 def _is_eigenvalue(matrix: FloatArray, mode: complex) -> bool:
-    """Decided by the least singular value, as rounding changes a defective eigenvalue by far more."""
+    """Decided by the least singular value, because rounding moves a defective eigenvalue by far more."""
     singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
     return float(singular[-1]) <= _RANK_TOLERANCE * float(np.linalg.norm(matrix, 2))
 
 
 def _random_gains(plant: Plant, pattern: Pattern, seed: int) -> list[FloatArray]:
-    """Gains with the pattern, of a size that moves modes about as far as the plant's own are apart."""
+    """Random gains with the pattern, scaled to move modes by about the distance between the plant's own modes."""
     rng = np.random.default_rng(seed)
     scale = _size(plant.A) / (_size(plant.B) * _size(plant.C))
     mask = pattern.mask
-    # magnitudes between 0.5 and 1.5: an entry close to 0 would hardly be a link
+    # magnitudes between 0.5 and 1.5: an entry close to 0 would barely count as a link
     draws = [rng.uniform(0.5, 1.5, mask.shape) * rng.choice([-1.0, 1.0], mask.shape) for _ in range(_RANDOM_GAINS)]
     return [scale * draw * mask for draw in draws]
 
 
 def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> tuple[tuple[Link, ...], ...]:
-    """Links that free the mode: every single one that does or, without any, one set found link by link.
+    """Sets of links that free the mode: all single links that do, or if none does, one set built link by link.
 
     If M and N are the left and right null spaces of A + B K C − λI for a random K, a full block K_ij raises the rank by
     min(rank M'B_i, rank C_j N).
@@ -155,7 +155,7 @@ def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -
 def _links_that_help(
     plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray
 ) -> tuple[int, list[tuple[Link, int]]]:
-    """The nullity, and every link outside the pattern that raises the rank, with the rank gained."""
+    """The nullity of A + B K C − λI, and every link outside the pattern that raises the rank, with the gain in rank."""
     left, singular, right = np.linalg.svd(plant.closed_loop(gain) - mode * np.eye(plant.states))
     nullity = int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
     if nullity == 0:
@@ -169,7 +169,7 @@ def _links_that_help(
 
 
 def _rank(matrix: FloatArray | ComplexArray) -> int:
-    """Rank of a matrix whose entries are either rounding or of the order of one."""
+    """Rank of a matrix whose entries are either rounding errors or of order one."""
     if matrix.size == 0:
         return 0
     singular = np.linalg.svd(matrix, compute_uv=False)
@@ -177,7 +177,7 @@ def _rank(matrix: FloatArray | ComplexArray) -> int:
 
 
 def _size(matrix: FloatArray) -> float:
-    """Largest absolute entry, or 1 if there is none: a scale to divide by."""
+    """Largest absolute entry, or 1 if all are zero: a scale to divide by."""
     largest = float(np.abs(matrix).max()) if matrix.size else 0.0
     return largest if largest > 0.0 else 1.0
 

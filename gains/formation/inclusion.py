@@ -1,7 +1,7 @@
 """Inclusion principle: from overlapping to disjoint subsystems and back, for any leader-follower chain or tree.
 
 The subsystems {e_0^v} and, for every follower i behind j, {e_j^v, e_i^p, e_i^v} overlap: they share velocity errors. In
-an expanded space each has its own copy of what it shares, so gains can be designed for one subsystem at a time;
+the expanded space each has its own copy of the shared errors, so gains can be designed for one subsystem at a time;
 contraction takes them back to the formation. All matrices are sparse.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 3, Theorems 2 and 3, eqs. (3.5)-(3.19), (3.25), (3.26).
@@ -19,7 +19,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 
-# a two-dimensional sparse array of scipy, which has no types
+# a two-dimensional sparse array of scipy, which ships no types
 Sparse = Any
 Restriction = Literal["a", "b"]
 
@@ -28,8 +28,8 @@ Restriction = Literal["a", "b"]
 class Expansion:
     """The expanded system x~' = A~ x~ + B~ u~ and the maps to and from it.
 
-    x~ = V x and u~ = R u expand; x = U x~ and u = Q u~ contract, UV = I, QR = I (3.5, 3.6). U = (V'V)^{-1} V' and
-    Q = (R'R)^{-1} R' take the mean of the copies. V (expanded states, states), R (expanded inputs, inputs), and so on.
+    x~ = V x and u~ = R u expand; x = U x~ and u = Q u~ contract, with UV = I and QR = I (3.5, 3.6). U = (V'V)^{-1} V'
+    and Q = (R'R)^{-1} R' average the copies.
     """
 
     V: Sparse
@@ -50,10 +50,10 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
 
     The expanded state is e_0^v, followed by (e_j^v, e_i^p, e_i^v) for every follower i behind j; the expanded input is
     u_0, followed by (u_j, u_i) (3.11-3.13). For type (a), A~ and B~ are block diagonal with the blocks (3.25). For
-    type (b), A~ is the same and B~ = VBQ moves all copies of a vehicle by the mean of its copied inputs. BadModelError
+    type (b), A~ is the same and B~ = VBQ drives all copies of a vehicle by the mean of its copied inputs. BadModelError
     for any other type.
 
-    In a chain of three, e_0^v, e_1^v, u_0 and u_1 have two copies each, of which U takes the mean:
+    In a chain of three, e_0^v, e_1^v, u_0 and u_1 have two copies each; U averages those of the states:
 
     >>> expansion = expand(FormationModel((-1, 0, 1)))
     >>> expansion.V.shape, expansion.R.shape, np.array_equal((expansion.U @ expansion.V).toarray(), np.eye(10))
@@ -73,7 +73,7 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
 def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> Sparse:
     """The block-diagonal gain K~ of the disjoint subsystems, sparse, shape (expanded inputs, expanded states).
 
-    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26). Arguments and exceptions as of
+    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26). Arguments and exceptions are those of
     `gains.formation.model.FormationModel.overlapping_gain`.
 
     >>> expanded_gain(FormationModel((-1, 0), axes=1), [[-3]], [[2]], [[1]]).toarray().tolist()
@@ -86,9 +86,9 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
     """K~_M: the expanded gain in which every copy of an input gets the command of the vehicle's own subsystem.
 
     In the gain of `expanded_gain` the copies of u_j disagree: K1 e_j^v in the subsystem of the vehicle behind j, the
-    full law in j's own. K~V = RK then has no solution K, and contraction would mix the two laws (3.17-3.19).
+    full law in j's own subsystem. K~V = RK then has no solution K, and contraction would mix both laws (3.17-3.19).
 
-    In a chain of three, the copy of u_1 in the subsystem behind gets the law of vehicle 1:
+    In a chain of three, the copy of u_1 in the subsystem of vehicle 2 gets the law of vehicle 1:
 
     >>> chain = FormationModel((-1, 0, 1), axes=1)
     >>> modified_gain(chain, expanded_gain(chain, [[-3]], [[2]], [[1]])).toarray()[3].tolist()
@@ -104,9 +104,9 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 
 
 def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
-    """K = Q K~ V, shape (inputs, states), of a gain K~ of shape (expanded inputs, expanded states).
+    """K = Q K~ V, shape (inputs, states), for a gain K~ of shape (expanded inputs, expanded states).
 
-    Back to the gain (3.19) of the formation, u_1 = 2 e_0^v + e_1^p − 3 e_1^v:
+    The result is the gain (3.19) of the formation, u_1 = 2 e_0^v + e_1^p − 3 e_1^v:
 
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> contracted_gain(expand(pair), modified_gain(pair, expanded_gain(pair, [[-3]], [[2]], [[1]]))).tolist()
@@ -118,12 +118,12 @@ def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
 def verify_inclusion(
     expansion: Expansion, A: ArrayLike, B: ArrayLike, *, K: ArrayLike, K_expanded: Sparse, tolerance: float = 1e-9
 ) -> float:
-    """The largest absolute entry by which the closed loop misses a condition for its inclusion in the expanded one.
+    """Largest absolute residual of the conditions under which the expanded closed loop includes the original one.
 
     The conditions are UV = I, QR = I (3.5, 3.6), A~V = VA, K = QK~V and, for restriction (a), B~R = VB and K~V = RK;
     for (b), B~ = VBQ. A (states, states), B (states, inputs) and K are the original system and its gain, `K_expanded`
-    is that of the expanded system. `tolerance` is relative to the largest entry of the matrices compared (at least 1).
-    Raises BadModelError if a condition is missed, with its name and residual.
+    is the gain of the expanded system. `tolerance` is relative to the largest entry of A, B and `K_expanded`, or to 1
+    if that is larger. Raises BadModelError with the name and residual of a condition that is not met.
 
     >>> chain, gains = FormationModel((-1, 0, 1), axes=1), ([[-3]], [[2]], [[1]])
     >>> K, K_expanded = chain.overlapping_gain(*gains), modified_gain(chain, expanded_gain(chain, *gains))
@@ -155,13 +155,13 @@ def verify_inclusion(
 
 
 def _disjoint(formation: FormationModel, matrix: Callable[[FormationModel], FloatArray]) -> Sparse:
-    """Block diagonal of a matrix of the subsystems (3.25): the leader, and each follower behind its predecessor."""
+    """Block diagonal matrix over the subsystems (3.25): the leader, and each follower with its predecessor."""
     leader, pair = (csr_array(matrix(FormationModel(who, formation.axes))) for who in ((-1,), (-1, 0)))
     return csr_array(block_diag([leader, *[pair] * len(formation.followers)], format="csr"))
 
 
 def _copied_blocks(formation: FormationModel) -> tuple[list[int], list[int]]:
-    """The index of the original block that each block of the expanded state, and of the expanded input, copies."""
+    """For each block of the expanded state, and of the expanded input, the index of the original block it copies."""
     states, inputs = [0], [0]
     for i in formation.followers:
         front = formation.predecessors[i]
@@ -184,6 +184,6 @@ def _mean_of_copies(copies: Sparse) -> Sparse:
 
 
 def _largest(matrix: Sparse) -> float:
-    """Largest absolute entry; 0 for a matrix without entries, NaN if one is NaN."""
+    """Largest absolute entry; 0 if none is stored, NaN if one is NaN."""
     entries = np.abs(matrix.data)
     return float(entries.max()) if entries.size else 0.0

@@ -20,18 +20,18 @@ LEADER = -1
 class FormationModel:
     """Linear error model e' = A e + B u of vehicles that each follow the vehicle in front.
 
-    Vehicle 0 is the leader; e_0^v = Z_0^v − v_d is its velocity error, its position is not controlled. For a follower i
-    behind vehicle j, with desired spacing d_i and positions and velocities Z^p, Z^v (thesis 2.10, 2.11)::
+    Vehicle 0 is the leader; its velocity error is e_0^v = Z_0^v − v_d, and its position is not controlled. A follower i
+    behind vehicle j, with desired spacing d_i and positions and velocities Z^p, Z^v (thesis 2.10, 2.11), has::
 
         e_i^p = Z_j^p − Z_i^p − d_i     spacing error,  e_i^p' = e_j^v − e_i^v
         e_i^v = Z_i^v − v_d             velocity error, e_i^v' = u_i
 
     The state is e = (e_0^v, e_1^p, e_1^v, e_2^p, e_2^v, ...), the input u = (u_0, u_1, ...), each entry with `axes`
-    components. BadModelError unless `predecessors` are whole numbers that name the leader first and then, for each
-    vehicle, an earlier one.
+    components. BadModelError unless `predecessors` are whole numbers: −1 for the leader, which comes first, then an
+    earlier vehicle for each of the others.
 
-    A leader and two followers in a chain. With K1 = −1, K3 = 1 per axis a follower has the loop
-    s² + (s + 1) e^{−sτ} = 0 and a delay margin of 0.711119 s:
+    In this chain of a leader and two followers, with K1 = −1 and K3 = 1 per axis, a follower has the characteristic
+    equation s² + (s + 1) e^{−sτ} = 0 and a delay margin of 0.711119 s:
 
     >>> from gains import FormationModel, delay_margin
     >>> chain = FormationModel((-1, 0, 1))
@@ -42,7 +42,7 @@ class FormationModel:
     """
 
     predecessors: tuple[int, ...]
-    """For each vehicle the index of the one it follows, −1 for the leader."""
+    """For each vehicle, the index of the vehicle it follows, −1 for the leader."""
     axes: int = 2
     """Number of controlled axes, 2 for north and east."""
 
@@ -53,7 +53,7 @@ class FormationModel:
 
     @property
     def vehicles(self) -> int:
-        """Number of vehicles, the leader among them."""
+        """Number of vehicles, including the leader."""
         return len(self.predecessors)
 
     @property
@@ -72,12 +72,12 @@ class FormationModel:
         return self.axes * self.vehicles
 
     def velocity_slice(self, vehicle: int) -> slice:
-        """Place of e_i^v in the state."""
+        """Slice of the state that holds e_i^v."""
         start = 2 * self.axes * self._known(vehicle)
         return slice(start, start + self.axes)
 
     def spacing_slice(self, vehicle: int) -> slice:
-        """Place of e_i^p in the state; the leader has none."""
+        """Slice of the state that holds e_i^p; BadModelError for the leader, which has none."""
         if self._known(vehicle) == 0:
             raise BadModelError("vehicle 0 is the leader and has no spacing error; wanted a follower")
         start = self.axes * (2 * vehicle - 1)
@@ -85,19 +85,19 @@ class FormationModel:
 
     @property
     def spacing_mask(self) -> BoolArray:
-        """Which entries of the state are spacing errors, (states,)."""
+        """Mask (states,) of the spacing errors in the state."""
         mask = np.zeros(self.states, dtype=np.bool_)
         for i in self.followers:
             mask[self.spacing_slice(i)] = True
         return mask
 
     def output_slice(self, vehicle: int) -> slice:
-        """Place of all errors of a vehicle in the state: e_i^p and e_i^v, for the leader e_0^v."""
+        """Slice of the state that holds all errors of a vehicle: e_i^p and e_i^v, for the leader e_0^v."""
         start = 0 if self._known(vehicle) == 0 else self.spacing_slice(vehicle).start
         return slice(start, self.velocity_slice(vehicle).stop)
 
     def input_slice(self, vehicle: int) -> slice:
-        """Place of u_i in the input."""
+        """Slice of the input that holds u_i."""
         start = self.axes * self._known(vehicle)
         return slice(start, start + self.axes)
 
@@ -127,9 +127,9 @@ class FormationModel:
             u_0 = K1 e_0^v
             u_i = K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
 
-        K1 is negative and K3 positive (definite) in a stable loop, because e_i^p grows as vehicle i falls behind. K1,
-        K2 and K3 act on the vehicle's own velocity error (1/s), that of the vehicle in front (1/s) and the spacing
-        error (1/s²); BadModelError unless each is a finite matrix of shape (axes, axes).
+        K1 (1/s) acts on the vehicle's own velocity error, K2 (1/s) on that of the vehicle in front, and K3 (1/s²) on
+        the spacing error. In a stable loop K1 is negative and K3 positive (definite), because e_i^p grows as vehicle i
+        falls behind. BadModelError unless each is a finite matrix of shape (axes, axes).
         """
         own, front, spacing = (
             checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
@@ -143,21 +143,21 @@ class FormationModel:
         return K
 
     def ground_loop(self, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) if a ground station closes every loop.
+        """(A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) if the ground station closes every loop.
 
-        All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
+        All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as for `overlapping_gain`.
         """
         return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
 
     def narrowed(self, K: FloatArray) -> tuple["FormationModel", FloatArray]:
-        """The formation and gain of one axis, if K (inputs, states) acts on every axis alike; else both as they are."""
+        """The formation and gain of one axis, if K (inputs, states) acts on every axis alike; else both unchanged."""
         one = K[:: self.axes, :: self.axes]
         if self.axes == 1 or not np.array_equal(K, np.kron(one, np.eye(self.axes))):
             return self, K
         return FormationModel(self.predecessors, axes=1), one
 
     def coupled_vehicles(self, K: FloatArray) -> list[list[int]]:
-        """Groups of vehicles that act on each other with the gain K (inputs, states), those ahead first."""
+        """Groups of vehicles that act on each other under the gain K (inputs, states), driving groups first."""
         outputs = [self.output_slice(i) for i in range(self.vehicles)]
         pattern = np.abs(self.A) + np.abs(self.B @ K)
         acts = np.array([[pattern[own, other].sum() for other in outputs] for own in outputs])
@@ -170,7 +170,7 @@ class FormationModel:
 
 
 def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
-    """The gain as a finite array of shape (axes, axes), or BadModelError with its name."""
+    """The gain as a finite array of shape (axes, axes); BadModelError names it otherwise."""
     array = real_matrix(name, gain)
     if array.shape != (axes, axes):
         raise BadModelError(f"{name} has shape {array.shape}; wanted ({axes}, {axes})")

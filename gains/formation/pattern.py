@@ -1,6 +1,6 @@
-"""Who may use whose output: information patterns of a decentralised static feedback u = K y, y = C x.
+"""Information patterns of a decentralised static feedback u = K y, y = C x: which input may use which output.
 
-A pattern is a binary block matrix: block (i, j) is 1 where the input of vehicle i may use the output of vehicle j. The
+A pattern is a binary block matrix: block (i, j) is 1 if the input of vehicle i may use the output of vehicle j. The
 gain may have any entries in these blocks and is zero elsewhere.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5.
@@ -22,7 +22,7 @@ Link = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """Linear plant x' = A x + B u, y = C x with A (n, n), B (n, inputs) and C (outputs, n), the identity if not given.
+    """Linear plant x' = A x + B u, y = C x with A (n, n), B (n, inputs) and C (outputs, n); C is the identity if None.
 
     BadModelError if a matrix is not finite and real, or the shapes do not fit.
     """
@@ -54,9 +54,9 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Binary block matrix of the gain K: which output each input may use.
+    """Binary block matrix of the gain K: which outputs each input may use.
 
-    BadModelError if an entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
+    BadModelError if an entry is not 0 or 1, a size is not a positive whole number, or sizes do not match the blocks.
     """
 
     blocks: BoolArray
@@ -100,18 +100,18 @@ class Pattern:
         return sum(self.output_sizes)
 
     def input_slice(self, i: int) -> slice:
-        """Place of u_i in u."""
+        """Slice of u that holds u_i."""
         return _place(self.input_sizes, i)
 
     def output_slice(self, j: int) -> slice:
-        """Place of y_j in y."""
+        """Slice of y that holds y_j."""
         return _place(self.output_sizes, j)
 
 
 def leader_follower(formation: FormationModel) -> Pattern:
     """The pattern (4.6): every vehicle uses its own output and that of the vehicle in front.
 
-    C = I: the leader's output is its velocity error, a follower's its spacing and velocity errors.
+    With C = I, the leader's output is its velocity error; a follower's is its spacing and velocity errors.
 
     >>> leader_follower(FormationModel((-1, 0, 1))).links
     ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2))
@@ -123,7 +123,7 @@ def leader_follower(formation: FormationModel) -> Pattern:
 
 
 def bidirectional(formation: FormationModel) -> Pattern:
-    """Every vehicle uses its own output and those of the vehicles in front and behind, as in section 5.
+    """The pattern of section 5: every vehicle uses its own output and those of the vehicles in front and behind.
 
     >>> bidirectional(FormationModel((-1, 0, 1))).blocks.astype(int).tolist()
     [[1, 1, 0], [1, 1, 1], [0, 1, 1]]
@@ -133,9 +133,9 @@ def bidirectional(formation: FormationModel) -> Pattern:
 
 
 def overlapping(formation: FormationModel, *, ahead: int = 1, behind: bool = False, leader: bool = False) -> Pattern:
-    """Every vehicle uses its own output, those of `ahead` vehicles in front and, if wanted, those behind or the leader.
+    """Every vehicle uses its own output and those of `ahead` vehicles in front; `behind` and `leader` add those.
 
-    More overlaps than the source's (4.6). BadModelError if `ahead` is below 1.
+    It overlaps more than the source's (4.6). BadModelError if `ahead` is below 1.
 
     >>> overlapping(FormationModel((-1, 0, 1, 2)), ahead=2, leader=True).blocks.astype(int).tolist()
     [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
@@ -165,7 +165,7 @@ def all_to_all(formation: FormationModel) -> Pattern:
 def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
     """The pattern with these links (i, j) added; BadModelError if one names a vehicle that is not in the pattern.
 
-    Vehicle 2 sees the leader as well:
+    Here vehicle 2 uses the leader's output as well:
 
     >>> with_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 0)]).blocks.astype(int).tolist()
     [[1, 0, 0], [1, 1, 0], [1, 1, 1]]
@@ -174,7 +174,7 @@ def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 
 
 def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
-    """The pattern without these links (i, j). Exceptions as of `with_links`.
+    """The pattern without these links (i, j). Exceptions as for `with_links`.
 
     >>> without_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 1)]).links
     ((0, 0), (1, 0), (1, 1), (2, 2))
@@ -183,7 +183,7 @@ def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 
 
 def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
-    """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if not given.
+    """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if None.
 
     >>> plant = formation_plant(FormationModel((-1, 0, 1)))
     >>> plant.A.shape, plant.B.shape, plant.C.shape
@@ -193,7 +193,7 @@ def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Pl
 
 
 def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
-    """K as a finite array of the pattern's shape that is zero outside it, or BadModelError."""
+    """K as a finite array of the pattern's shape; BadModelError if it is not, or is nonzero outside the pattern."""
     gain = real_matrix("K", K)
     mask = pattern.mask
     if gain.shape != mask.shape:
@@ -210,7 +210,7 @@ def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
 
 
 def check_fits(plant: Plant, pattern: Pattern) -> None:
-    """Raise BadModelError unless plant and pattern have as many inputs and outputs."""
+    """Raise BadModelError unless plant and pattern have the same numbers of inputs and outputs."""
     if (plant.B.shape[1], plant.C.shape[0]) != (pattern.inputs, pattern.outputs):
         raise BadModelError(
             f"the pattern has {pattern.inputs} inputs and {pattern.outputs} outputs; {plant.B.shape[1]} and "

@@ -1,8 +1,8 @@
-"""The delay margin of any linear loop that `gains.margin.model_file` reads, with what confirms it.
+"""The delay margin of any linear loop that `gains.margin.model_file` reads, and the methods that confirm it.
 
 The analysis depends on the model: `gains.delay._commensurate` for multiples of the unknown delay, `gains.delay._mixed`
-if there are known delays beside it, `gains.sampled.constant` for a held loop of known period, and
-`gains.sampled._period` if the period is the unknown. `gains.margin.opinions` confirms what it can.
+if there are also known delays, `gains.sampled.constant` for a held loop with known period, and `gains.sampled._period`
+if the period is the unknown. `gains.margin.opinions` gives second opinions on continuous loops.
 """
 
 from collections.abc import Callable
@@ -34,25 +34,25 @@ from gains.sampled._loop import HeldPlant, held_blocks, lifted_map, radius_of
 _MOST_STEPS = 200
 # most digits printed
 _DIGITS = 6
-# errors are estimated for the first crossings only: there may be thousands
+# errors are estimated only for the first crossings: there may be thousands
 _ERRORS_OF = 100
-# the spectral radius is computed this far beside the margin of a held loop, relative to it,
+# the spectral radius is checked at this relative distance on each side of the margin of a held loop
 _BESIDE = 1e-4
-# for one-period maps up to this size, which take 0.2 s
+# largest one-period map that is checked; it takes 0.2 s
 _LARGEST_MAP = 300
-# an eigenvalue of such a map is known to this
+# error of an eigenvalue of such a map
 _ROUNDING = 1e-11
-# its backward error, in units of n eps and the norm of the map
+# backward error of such a map, in units of n eps and its norm
 _BACKWARD = 10.0
 
 
 @dataclass(frozen=True)
 class MarginCrossing:
-    """Roots on the imaginary axis, or on the unit circle of a sampled loop, at one value of the unknown.
+    """Roots on the imaginary axis, or on the unit circle for a sampled loop, at one value of the unknown.
 
-    `delay_s` is that value, known to `delay_error_s` (nan if not estimated); `direction` is as of
-    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None for sampled loops, and `repeats_every_s` for
-    a real root, which passes zero once.
+    `delay_s` is that value and `delay_error_s` its error (nan if not estimated); `direction` is as in
+    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None for sampled loops. `repeats_every_s` is also
+    None for a real root, which passes zero once.
     """
 
     omega_rad_s: float
@@ -68,17 +68,17 @@ class LoopMargin:
     """The verdict on a loop for all values of its `unknown`: a delay, or the sampling period."""
 
     unknown: str
-    """Its name; "period" for the sampling period."""
+    """Name of the unknown; "period" for the sampling period."""
     stable_intervals_s: tuple[tuple[float, float], ...]
-    """The windows of stability, complete up to `complete_to_s`; the last may end at inf."""
+    """The stability windows, complete up to `complete_to_s`; the last may end at inf."""
     delay_margin_s: float
     delay_margin_error_s: float
-    """The end of the window that begins at 0, or 0 without one, and its estimated error; nan if that is not known."""
+    """The end of the window that begins at 0, or 0 if none does, and its estimated error; nan if that is unknown."""
     crossings: tuple[MarginCrossing, ...]
     unstable_roots_at_zero_delay: int
-    """The number of roots right of the axis with the unknown at zero."""
+    """The number of unstable roots when the unknown is zero."""
     roots_fixed_at_zero: int = 0
-    """The number of roots that stay at 0, or at z = 1 of a held loop, and are left out of all else."""
+    """The number of roots that stay at 0 (at z = 1 for a held loop); they are left out of everything else."""
     complete_to_s: float
     checked_by: tuple[str, ...] = ()
     """The methods that confirmed the windows."""
@@ -87,7 +87,7 @@ class LoopMargin:
 
 @dataclass(frozen=True)
 class LoopAtGivenDelays:
-    """A loop whose delays are all known: its rightmost root (1/s), and its unstable roots without any delay."""
+    """A loop whose delays are all known: its rightmost root (1/s), and its number of unstable roots without delay."""
 
     rightmost_root: complex
     unstable_roots_at_zero_delay: int
@@ -101,8 +101,8 @@ class LoopAtGivenDelays:
 def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
     """The delays, or the sampling periods, at which the loop of a model is stable.
 
-    Raises BadModelError if the model cannot be analysed, with what was read and what was wanted, and DisagreementError
-    if independent methods gave different answers.
+    Raises BadModelError if the model cannot be analysed, saying what was read and what was wanted, and
+    DisagreementError if independent methods give different answers.
 
     >>> from gains import loop_margin, parse_model
     >>> found = loop_margin(parse_model('{"A0": [[0]], "A1": [[-1]]}'))
@@ -115,14 +115,14 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 
 
 def as_known(value: float, error: float) -> str:
-    """A number with the digits that its error leaves, six at most; the last one is off by at most one.
+    """A number printed with the digits that its error permits, at most six; the last is off by at most one.
 
     >>> as_known(0.8152534, 1e-12), as_known(0.8152534, 8e-5), as_known(0.8152534, 0.4)
     ('0.815253', '0.815', '0.8')
     """
     if not error > 0.0 or value == 0.0:
         return f"{value:.{_DIGITS}g}"
-    # a unit of the last digit is at least twice the error: rounding to it takes the other half
+    # a unit of the last digit is at least twice the error: the error takes one half of it, rounding the other
     digits = floor(log10(abs(value))) + 1 - ceil(log10(2.0 * error))
     return f"{value:.{min(max(digits, 1), _DIGITS)}g}"
 
@@ -177,7 +177,7 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
 
 
 def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysis, int]:
-    """The terms with each of their distinct blocks once, the analysis of all, and the number of equilibria left out."""
+    """The terms with each distinct block once, the analysis of the loop, and the number of equilibria left out."""
     from gains.delay._commensurate import analyse_block
     from gains.delay._mixed import analyse_mixed_block
 
@@ -197,24 +197,24 @@ def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysi
 
 
 def _fixed_note(fixed: int, where: str) -> tuple[str, ...]:
-    """What is said of roots that are left out; nothing without one."""
+    """Note on the roots that are left out; empty if there are none."""
     stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
     why = "an equilibrium, as the common value of a consensus"
     return (f"{stay} at {where} ({why}); all else is said of the others",) if fixed else ()
 
 
 def _held_moving(model: HeldModel) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int]:
-    """A, B and K of a held loop without its equilibria, and how many states these were.
+    """A, B and K of a held loop without its equilibria, and the number of states removed.
 
     A direction along which neither A nor B K acts keeps an eigenvalue of the one-period map at one, at every delay and
-    period; rounding would put it on either side.
+    period; rounding would move it to either side of the unit circle.
     """
     (plant, feedback), fixed = without_equilibria(model.A, model.B @ model.K)
     return ((plant, *factor_rank(feedback)), fixed) if fixed else ((model.A, model.B, model.K), 0)
 
 
 def _held_parts(loop: tuple[FloatArray, FloatArray, FloatArray], period_s: float) -> list[tuple[HeldPlant, int]]:
-    """The blocks of a held loop with their copies; the whole loop once where no two are equal."""
+    """The blocks of a held loop with their numbers of copies; the whole loop, once, if no two blocks are equal."""
     A, B, K = loop
     plants, copies = held_blocks(A, B, K, period_s=period_s), [block.copies for block in distinct_blocks(A, B @ K)]
     return list(zip(plants, copies, strict=True)) if max(copies) > 1 else [(HeldPlant(A, B, K, period_s), 1)]
@@ -231,7 +231,7 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
     from gains.sampled._period import analyse_period
 
     loop, fixed = _held_moving(model)
-    # equal followers in one map would have no eigenvalue of their own
+    # block by block: equal followers in one map would spoil each other's eigenvalues
     parts = [part for part, _ in _held_parts(loop, 1.0)]
 
     def map_at(part: HeldPlant, period_s: float) -> FloatArray:
@@ -262,13 +262,13 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
 
 
 def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
-    """The first window of the held loop as it is flown."""
+    """The first stability window of the held loop as flown."""
     from gains.sampled._crossings import block_delay_margin
     from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
     loop, fixed = _held_moving(model)
     parts = _held_parts(loop, period_s)
-    # equal followers in one map would have no eigenvalue of their own
+    # block by block: equal followers in one map would spoil each other's eigenvalues
     first = parts[0][0] if len(parts) == 1 else min((part for part, _ in parts), key=block_delay_margin)
 
     def map_at(delay_s: float) -> FloatArray:
@@ -280,7 +280,7 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     if 0.0 < margin_s < inf and len(first.A) + first.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
         delays_s = [(1.0 - _BESIDE) * margin_s, margin_s, (1.0 + _BESIDE) * margin_s]
         before, at, after = (spectral_radius(*loop, period_s=period_s, delay_s=delay_s) for delay_s in delays_s)
-        # it may touch one at a whole period and be smaller on both sides
+        # the radius may touch one at a whole period and be smaller on both sides
         if before >= 1.0 or max(at, after) < 1.0 - _ROUNDING:
             raise DisagreementError(
                 f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of the "
@@ -309,7 +309,7 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
 
 
 def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
-    """Error (s) of the instant at which the spectral radius of a one-period map passes one, by rounding."""
+    """Rounding error (s) of the delay or period at which the spectral radius of a one-period map passes one."""
     matrix = map_at(at_s)
     size = len(matrix)
     if size > _LARGEST_MAP:
@@ -319,7 +319,7 @@ def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
     slope = abs(after - before) / (2.0 * step_s)
     eigenvalues, vectors = np.linalg.eig(matrix)
     epsilon = _BACKWARD * size * float(np.finfo(np.float64).eps) * float(np.linalg.norm(matrix))
-    # left and right vectors of the largest eigenvalue: their angle is its condition
+    # the angle between left and right eigenvectors of the largest eigenvalue determines its condition
     k = int(np.argmax(np.abs(eigenvalues)))
     left = np.linalg.svd(matrix - eigenvalues[k] * np.eye(size))[0][:, -1]
     angle = abs(complex(left.conj() @ vectors[:, k]))
@@ -328,6 +328,6 @@ def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
 
 
 def _common_divisor(multiples: list[Fraction]) -> Fraction:
-    """The largest fraction of which all multiples are whole multiples; 1 if all are zero."""
+    """The largest fraction that divides all multiples; 1 if all are zero."""
     denominator = lcm(*(multiple.denominator for multiple in multiples))
     return Fraction(gcd(*(int(multiple * denominator) for multiple in multiples)), denominator) or Fraction(1)

@@ -1,4 +1,4 @@
-"""The JSON model of a linear loop with delays that `gcs margin` reads, in one of these forms::
+"""Reader of JSON models of linear loops with delays, as for `gcs margin`, in one of these forms::
 
     {"A0": [[..]], "A1": [[..]]}                                   x'(t) = A0 x(t) + A1 x(t - tau)
     {"terms": [{"A": [[..]], "delay": 0.1}, {"A": [[..]], "delay": "2*tau"}, ...]}   x'(t) = sum A x(t - delay)
@@ -45,17 +45,17 @@ _FORMS = (
     ("num", "den"),
 )
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
-# products and squares of entries up to this do not overflow, and the square of a product of two least ones is normal
+# squares and products of the largest entries do not overflow; the square of a product of two least ones is still normal
 _LARGEST, _LEAST = 1e30, 1e-60
-# strings that stand for so many zeros in a row, the most first; nobody writes a zero byte
+# strings that stand for runs of zeros, longest first; a zero byte does not occur in hand-written models
 _ZEROS = {"\0 512 zeros": 512, "\0 64 zeros": 64, "\0 8 zeros": 8}
-# longer texts are cut in messages
+# longer texts are truncated in messages
 _SHOWN = 60
 
 
 @dataclass(frozen=True)
 class Term:
-    """A x(t - fixed_s - multiple * unknown), `matrix` A (n, n) in 1/s."""
+    """The term A x(t - fixed_s - multiple * unknown); `matrix` is A (n, n) in 1/s."""
 
     matrix: FloatArray
     fixed_s: float
@@ -74,7 +74,7 @@ class DelayModel:
 class HeldModel:
     """x' = A x + B u with u = K x sampled and held; A (n, n), B (n, p), K (p, n).
 
-    The unknown is the delay of u if the period is given, else the period.
+    The unknown is the delay of u if the period is given, otherwise the period.
     """
 
     A: FloatArray
@@ -86,7 +86,7 @@ class HeldModel:
 def parse_model(text: str) -> DelayModel | HeldModel:
     """The model that `text` describes.
 
-    BadModelError says in one line which key, what was read and what was wanted.
+    BadModelError names in one line the key, what was read and what was wanted.
 
     >>> model = parse_model('{"terms": [{"A": [[-1]], "delay": "0.1 + 2*tau"}]}')
     >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
@@ -111,9 +111,9 @@ def parse_model(text: str) -> DelayModel | HeldModel:
 
 
 def with_short_zeros(text: str) -> str:
-    """The text of a model, or a part of it, with one string for many zeros in a row.
+    """The text of a model, or part of it, with each run of zeros replaced by one string.
 
-    `parse_model` reads either, but spends most of its time on zeros in a model of many states.
+    `parse_model` reads both; with many states, zeros would take most of its time.
     """
     for name, count in _ZEROS.items():
         for zero in (" 0.0,", " 0,"):
@@ -126,7 +126,7 @@ def _pair(now: FloatArray, late: FloatArray) -> DelayModel:
 
 
 def _polynomial(key: str, value: Any) -> FloatArray:
-    """Coefficients; MATLAB writes them as a row, a matrix."""
+    """Coefficients as a matrix of one row; MATLAB writes them so."""
     if not isinstance(value, list) or not value:
         _bad(key, value, "coefficients as a list, [1, 2, 3]")
     return _matrix(key, value if isinstance(value[0], list) else [value])
@@ -140,7 +140,7 @@ def _parsed(text: str) -> Any:
                 raise BadModelError(f"{key}: read twice, wanted once")
         return dict(items)
 
-    # the collector would look at the rows again and again, in vain: numbers form no cycles
+    # the garbage collector would scan the rows over and over in vain: numbers form no cycles
     collecting = gc.isenabled()
     gc.disable()
     try:
@@ -242,7 +242,7 @@ def _matrix(key: str, value: Any) -> FloatArray:
                 matrix = np.zeros(len(rows) * length)
                 matrix[[i * length + place for i, (places, *_) in enumerate(rows) for place in places]] = numbers
                 return matrix.reshape(len(rows), length)
-    # one entry is not as wanted: which?
+    # some entry is invalid: find it
     for i, (places, written, _) in enumerate(rows):
         for j, entry in zip(places, written, strict=True):
             _finite(f"{key}, row {i + 1}, column {j + 1}", entry, "a finite number")
@@ -250,7 +250,7 @@ def _matrix(key: str, value: Any) -> FloatArray:
 
 
 def _written_out(row: list[Any]) -> tuple[Sequence[int], list[Any], int]:
-    """The places and the entries of a row that are written out, and the length of the row."""
+    """The positions and values of the entries of a row that are written out, and the length of the row."""
     if str not in set(map(type, row)):
         return range(len(row)), row, len(row)
     places: list[int] = []
@@ -285,7 +285,7 @@ def _finite(key: str, value: Any, wanted: str) -> float:
 
 
 def _delay(key: str, value: Any) -> tuple[float, Fraction, str]:
-    """Seconds, multiple, and the name of the unknown (empty without one)."""
+    """Seconds, multiple, and the name of the unknown (empty if there is none)."""
     if not isinstance(value, str):
         number = _finite(key, value, _DELAY_WANTED)
         if number < 0.0:

@@ -1,7 +1,7 @@
-"""Loops given as a system between input and output: of python-control, of `scipy.signal`, or in a model file.
+"""Loops given as an input-output system: from python-control, from `scipy.signal`, or from a model file.
 
-The loop is closed by u(t) = -y(t - tau), the negative feedback of unit gain that margins of open loops refer to. Gains
-of another sign or size belong to the system: -K (s I - A)^{-1} B for u = +K x. Neither package is imported; a system is
+The loop is closed by u(t) = -y(t - tau), the negative unit feedback that margins of open loops refer to. Gains of
+another sign or size belong to the system: -K (s I - A)^{-1} B for u = +K x. Neither package is imported; a system is
 recognised by its attributes.
 """
 
@@ -18,13 +18,13 @@ from gains.core.structure import real_matrix, square_matrices
 def delayed_feedback(system: Any) -> tuple[FloatArray, FloatArray]:
     """(A0, A1) of x'(t) = A0 x(t) + A1 x(t - tau), the loop of y = L(s) u closed by u(t) = -y(t - tau).
 
-    `system` has the attributes A, B, C and D, as a `StateSpace`, or `num` and `den` with the highest power first, as a
-    `TransferFunction` of one input and output. A0 = A, A1 = -B C, both (n, n) in 1/s.
+    `system` has the attributes A, B, C and D, like a `StateSpace`, or `num` and `den` with the highest power first,
+    like a `TransferFunction` with one input and one output. A0 = A, A1 = -B C, both (n, n) in 1/s.
 
-    Raises BadModelError if the system has neither, is of discrete time, has a direct path from input to output (its
-    loop then has infinitely many roots near a vertical line), or has fewer or more outputs than inputs.
+    Raises BadModelError if the system has neither, is discrete in time, has a direct path from input to output (its
+    loop then has infinitely many roots near a vertical line), or does not have as many outputs as inputs.
 
-    1 / (s (s + 1)) has a phase margin of 51.8° at 0.786 rad/s, which is 1.15 s of delay there:
+    1 / (s (s + 1)) has a phase margin of 51.8° at 0.786 rad/s, a delay of 1.15 s at that frequency:
 
     >>> from scipy.signal import TransferFunction
     >>> from gains import delay_margin, delayed_feedback
@@ -46,7 +46,7 @@ def delayed_feedback(system: Any) -> tuple[FloatArray, FloatArray]:
 def feedback_of_matrices(
     A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """The same of a state-space system: A (n, n), B (n, p), C (p, n), D (p, p) zero.
+    """`delayed_feedback` of a state-space system: A (n, n), B (n, p), C (p, n), D (p, p) zero; raises likewise.
 
     >>> feedback_of_matrices([[0, 1], [0, -1]], [[0], [1]], [[1, 0]])[1].tolist()
     [[0.0, 0.0], [-1.0, 0.0]]
@@ -62,7 +62,7 @@ def feedback_of_matrices(
 
 
 def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]:
-    """The same of num / den with the highest power first, also nested as [[num]].
+    """`delayed_feedback` of num / den, highest power first, also nested as [[num]]; raises likewise.
 
     >>> sum(feedback_of_polynomials([2], [1, 3])).tolist()
     [[-5.0]]
@@ -78,7 +78,7 @@ def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]
 
 
 def _polynomial(name: str, value: Any) -> FloatArray:
-    """The coefficients from the first that is not zero on; at least one."""
+    """The coefficients without leading zeros; at least one."""
     try:
         nested = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

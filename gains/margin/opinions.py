@@ -1,8 +1,8 @@
-"""Second opinions on an analysis of one unknown delay, and how many of its digits are known.
+"""Second opinions on an analysis of one unknown delay, and the error of its margin.
 
-A sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`), and the rightmost root beside the ends of the
-windows or, for large loops and where a root at zero is left out, a root count by the argument principle: none shares
-algebra with the exact analysis. A difference that rounding does not explain is an error.
+There are three: a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`), and on both sides of the ends
+of windows the rightmost root or, for large loops or if a root at zero is left out, a root count by the argument
+principle. None shares algebra with the exact analysis. A difference beyond rounding raises DisagreementError.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,22 +17,22 @@ from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
-# sum of n^3 over blocks of n states: a sweep takes 0.2 s here, and 0.08 s for one block of 12 states
+# largest sum of n^3 over blocks of n states: a sweep takes 0.2 s there, and 0.08 s for one block of 12 states
 _SWEEP_BUDGET = 14_000
-# states times points of a discretised spectrum: 30 ms
+# largest number of states times points in a discretised spectrum: 30 ms
 _SPECTRUM_BUDGET = 200
-# turns of the longest delay up to the highest frequency, for a count of roots: 0.1 s
+# largest turn (rad) of the longest delay at the highest frequency for a root count: 0.1 s
 _COUNT_BUDGET = 1000.0
-# frequencies of a count at delay zero; frequencies times n^3 for inverses of n states: 4 s
+# frequencies in a count at zero delay; largest number of frequencies times n^3 for inverses of n states: 4 s
 _COUNT_POINTS, _INVERSE_BUDGET = 400, 1e10
-# rad; a root that crosses within this turn of its frequency may be near the axis
+# rad; roots are near the axis at delays within this angle, at their frequency, of a crossing
 _NEAR_TURN = 0.2
-# the spectrum is computed this far inside and outside a window, relative to its end
+# the spectrum is computed at this distance inside and outside a window, relative to its end
 _BESIDE = 1e-4
-# a thorough check also looks at these fractions of a window
+# a thorough check also tests these fractions of a window
 _FRACTIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
-# two methods agree if they differ by less than this (relative), or than so many errors of the crossing; a missed
-# crossing is off by far more
+# two methods agree if they differ by less than this (relative), or by less than this many errors of the crossing; a
+# missed crossing differs by far more
 _AGREEMENT, _ERRORS = 1e-6, 4.0
 # a rightmost root this close to the axis, relative to the norm, decides nothing
 _UNDECIDED = 1e-9
@@ -43,9 +43,9 @@ _TOUCH = 1e-7
 def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root below and above it.
 
-    A hundred times slower: for a design that is to be flown, not for the inside of an optimisation. Arguments as of
+    A hundred times slower: for a design to be flown, not for use inside an optimisation. Arguments as for
     `gains.delay.constant.delay_margin`. Raises BadModelError unless the matrices are square, finite and of one size,
-    and DisagreementError if the methods differ, with what each one found.
+    and DisagreementError, with the result of each method, if the methods differ.
 
     >>> round(checked_delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
@@ -61,7 +61,7 @@ def second_opinions(
 ) -> tuple[tuple[str, ...], float]:
     """The methods that confirm an analysis of x'(t) = sum of the terms, and the estimated error (s) of its margin.
 
-    Only methods that take no more than a fraction of a second; if `thorough`, every method, at more delays.
+    It uses only methods that take a fraction of a second; if `thorough`, every method, at more delays.
     DisagreementError if a method contradicts the analysis. The error of a margin of 0 or `inf` is 0.
     """
     margin_s, error_s = analysis.delay_margin_s, 0.0
@@ -79,10 +79,10 @@ def second_opinions(
 
 
 def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:
-    """The margin that the sweep finds; None where it does not apply or would take long."""
+    """The margin found by the sweep; None if it does not apply or would take too long."""
     from gains.delay.sweep import circle_sweep_margin
 
-    # the sweep finds no margin for a loop with roots on the axis at zero delay, which it judges by eigenvalues
+    # the sweep judges zero delay by eigenvalues, so it finds no margin for a loop with roots on the axis there
     on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)
     if on_axis or any(term.known_s for term in terms):
         return None
@@ -94,11 +94,11 @@ def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thoroug
 
 
 def _agrees(analysis: DelayAnalysis, swept_s: float, error_s: float, terms: Sequence[DelayedTerm]) -> bool:
-    """Whether the sweep found the same margin; False if it missed a root that is on the axis there, else an error."""
+    """Whether the sweep found the same margin; False if it missed a root on the axis, otherwise DisagreementError."""
     margin_s = analysis.delay_margin_s
     if margin_s == swept_s or abs(margin_s - swept_s) <= max(_AGREEMENT * margin_s, _ERRORS * error_s):
         return True
-    # a search easily misses a mere touch, or a motion that is slow beside others
+    # a search easily misses a touch, or a motion that is slow beside others
     if margin_s < swept_s and any(_is_root(terms, c) for c in analysis.crossings if c.delay_s == margin_s):
         return False
     raise DisagreementError(f"the exact delay margin is {margin_s} s, the sweep says {swept_s} s")
@@ -116,7 +116,7 @@ def _is_root(terms: Sequence[DelayedTerm], crossing: Crossing) -> bool:
 def _confirmed_beside_windows(
     analysis: DelayAnalysis, terms: Sequence[DelayedTerm], error_s: float, thorough: bool
 ) -> set[str]:
-    """Compare the windows with the spectrum inside and beside them; the methods by which a delay could be checked."""
+    """Compare the windows with the spectrum inside and outside them; return the methods that could check a delay."""
     rate = sum(float(np.linalg.norm(term.matrix)) for term in terms)
     largest = max(len(block.matrices[0]) for block in distinct_blocks(*(term.matrix for term in terms)))
     methods: set[str] = set()
@@ -139,7 +139,7 @@ def _confirmed_beside_windows(
 
 
 def _growth(pairs: Sequence[tuple[FloatArray, float]]) -> float:
-    """Real part (1/s) of the rightmost root; nan where the delay is too long for its discretisation."""
+    """Real part (1/s) of the rightmost root; nan if the delay is too long to discretise."""
     from gains.delay.rightmost import rightmost_root
 
     try:
@@ -149,10 +149,10 @@ def _growth(pairs: Sequence[tuple[FloatArray, float]]) -> float:
 
 
 def _sign_of_growth(analysis: DelayAnalysis, pairs: Sequence[tuple[FloatArray, float]], tau_s: float) -> float:
-    """1 if a count finds roots right of the axis, -1 if none; nan where one is too close to it."""
+    """1 if a count finds roots right of the axis, -1 if it finds none; nan if one is too close to the axis."""
     from gains.delay._mixed import count_unstable_roots
 
-    # frequencies of the crossings whose delay is so near that their roots are near the axis
+    # frequencies of the crossings at delays so close that their roots are still near the axis
     away = ((c.omega_rad_s, c.omega_rad_s * (tau_s - c.delay_s)) for c in analysis.crossings)
     beside = [omega for omega, turn in away if abs(float(np.angle(np.exp(1j * turn)))) < _NEAR_TURN]
     try:
@@ -165,10 +165,10 @@ def _sign_of_growth(analysis: DelayAnalysis, pairs: Sequence[tuple[FloatArray, f
 def _delays_to_look_at(
     analysis: DelayAnalysis, rate: float, error_s: float, thorough: bool
 ) -> Iterator[tuple[float, bool]]:
-    """Delays beside the ends of the first windows and inside them, each with the verdict that the windows imply."""
+    """Delays near the ends of the first two windows and inside them, each with the verdict implied by the windows."""
     windows = analysis.stable_intervals_s
     if not windows:
-        # rounding may take a root on the axis to either side: only roots off the axis count
+        # rounding may move a root on the axis to either side, so only roots off the axis count
         if analysis.unstable_roots_at_zero_delay > 0 and rate > 0.0:
             yield 0.0, False
         return
@@ -182,7 +182,7 @@ def _delays_to_look_at(
         if thorough:
             yield from ((start_s + fraction * (end_s - start_s), True) for fraction in _FRACTIONS)
         following = [start for start, _ in windows if start > start_s]
-        # windows may touch: at a double root that only touches the axis
+        # two windows may meet at a delay where a double root only touches the axis
         if not following or following[0] > end_s + 2.0 * beside_s:
             yield end_s + beside_s, False
         if start_s > 0.0:

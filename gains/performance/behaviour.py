@@ -1,7 +1,7 @@
-"""How a formation behaves inside its delay margin: block by block, with and without delay, and down the chain.
+"""Behaviour of a formation inside its delay margin: block by block, with and without delay, and down the chain.
 
-Whatever the size of a leader-follower tree, its roots are those of the leader's block and of one follower's block, and
-errors pass from vehicle to vehicle by one transfer function.
+For a leader-follower tree of any size, the roots are those of the leader's block and of one follower's block, and
+errors pass from vehicle to vehicle through one transfer function.
 
 Source: Sahoo 2012 (see `gains.formation.model`), eq. (2.11) with the gains (3.26).
 """
@@ -29,27 +29,27 @@ class BlockMargin:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the loop behaves inside its margin."""
+    """Decay, damping and growth of errors of a loop inside its margin."""
 
     decay_rate_1_s: float
     damping: float
-    """−Re of the rightmost root of the whole formation, and the least damping ratio −Re s / |s|, without delay."""
+    """−Re s of the rightmost root of the whole formation, and the least damping ratio −Re s / |s|, without delay."""
     decay_rate_delayed_1_s: float
     damping_delayed: float
     """Decay rate, and damping ratio of the follower's rightmost root, at the delay `delay_s`."""
     string_peak: float
     string_peak_delayed: float
     """Largest growth of a spacing error from one vehicle to the next, over all frequencies, without delay and at
-    `delay_s`; down a chain of n followers errors grow by its (n − 1)th power at most."""
+    `delay_s`; down a chain of n followers errors grow at most by its (n − 1)th power."""
     delay_s: float
-    """The constant delay of the figures with delay; `gains.design.design` takes half the sampled margin, plus half a
-    period for the hold."""
+    """The constant delay of the delayed figures; `gains.design.design` uses half the sampled margin plus half a period
+    for the hold."""
 
 
 def diagonal_blocks(gains: Gains) -> list[tuple[FloatArray, FloatArray]]:
-    """(A0, A1) of e' = A0 e + A1 e(t − τ) of the leader, e_0^v, and of a follower, (e_i^p, e_i^v).
+    """(A0, A1) of e' = A0 e + A1 e(t − τ) for the leader, e_0^v, and for a follower, (e_i^p, e_i^v).
 
-    K2 couples the two and is in neither.
+    K2 couples the two and appears in neither.
     """
     axes = len(gains[0])
     A0, A1 = FormationModel((-1, 0), axes).ground_loop(*gains)
@@ -59,7 +59,7 @@ def diagonal_blocks(gains: Gains) -> list[tuple[FloatArray, FloatArray]]:
 def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
     """Return the margin of x'(t) = A0 x(t) + A1 x(t − τ) and the frequency of the crossing at its end.
 
-    The frequency is NaN if there is no crossing. Arguments as of `gains.delay.constant.analyse_delay`.
+    The frequency is NaN if there is no crossing. Arguments as for `gains.delay.constant.analyse_delay`.
     """
     analysis = analyse_delay(A0, A1, horizon_s=1e-300)
     first = min(analysis.crossings, key=lambda crossing: abs(crossing.delay_s - analysis.delay_margin_s), default=None)
@@ -71,10 +71,10 @@ def behaviour(
 ) -> Behaviour:
     """Return the behaviour of a formation whose leader and followers have the gains K1, K2 and K3.
 
-    For the figures with delay all feedback is late by the constant `delay_s`, except that a vehicle's own errors are
-    late by `own_delay_s` if that is given. Followers add the share `feed_forward` of the command in front.
+    For the delayed figures, all feedback is late by the constant `delay_s`, except that a vehicle's own errors are late
+    by `own_delay_s` if that is given. Followers add the share `feed_forward` of the command in front.
 
-    The leader's root is −1, the follower's s² + s + 1 has damping 1/2:
+    The leader's root is −1; the follower's loop s² + s + 1 has damping 1/2:
 
     >>> found = behaviour((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), delay_s=0.3)
     >>> round(found.decay_rate_1_s, 6), round(found.damping, 6)

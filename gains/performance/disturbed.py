@@ -1,18 +1,18 @@
-"""What gusts and noise do to a formation in flight: the stationary spread of its errors, exact at a loop delay.
+"""Effect of gusts and noise on a formation in flight: the stationary spread of its errors, exact at a loop delay.
 
-The loop is sampled and held (`gains.sampled.constant`), with everything that pushes it::
+The loop is sampled and held (`gains.sampled.constant`), with all disturbances::
 
     x' = A x + B u + E w,     w' = −w / τ_w + white noise     gusts: accelerations, standard deviation σ_w
-    u_k = K (x_k + M (ν_k + b_k))                              what the station knows is wrong by noise and bias
+    u_k = K (x_k + M (ν_k + b_k))                              noise and bias in the states known to the station
     b_{k+1} = e^{−T/τ_b} b_k + white noise
 
-ν is white, b has the correlation time τ_b, and M takes errors of positions and velocities to those of e. Vehicles may
+ν is white, b has the correlation time τ_b, and M maps errors of positions and velocities to errors of e. Vehicles may
 sample at different instants: the station then interpolates between two reports of another vehicle, which averages their
-noise, and ν_{k−1} is one more state. A station that predicts feeds back the state that it expects at the loop delay it
-assumes, from its own commands; it starts from the newest report of each vehicle and interpolates nothing.
+noise, and ν_{k−1} is one more state. A predicting station feeds back the state that it expects at its assumed loop
+delay, from its own commands; it starts from the newest report of each vehicle and does not interpolate.
 
-With the gust among the states and late commands beside them, one period is s_{k+1} = F s_k + noise of covariance Q, and
-the stationary covariance is P = F P F' + Q, which doubling solves: P = Q + F Q F' + F² Q F²' + ... A steady wind adds a
+With gusts and late commands added to the state, one period is s_{k+1} = F s_k + noise of covariance Q, and the
+stationary covariance is P = F P F' + Q, which doubling solves: P = Q + F Q F' + F² Q F²' + ... A steady wind adds a
 mean.
 """
 
@@ -39,7 +39,7 @@ from gains.sampled.multirate import Predictor, Timing, multirate_map
 
 @dataclass(frozen=True)
 class Gusts:
-    """First-order gusts: an acceleration on each axis of each vehicle, or the same for all of them."""
+    """First-order gusts: an independent acceleration on each axis of each vehicle, or one common to all vehicles."""
 
     deviation_m_s2: float
     correlation_s: float
@@ -48,7 +48,7 @@ class Gusts:
 
 @dataclass(frozen=True)
 class Sensing:
-    """Errors of reported positions and velocities on each axis: white noise, and a bias of the first order."""
+    """Errors of reported positions and velocities on each axis: white noise and a first-order bias."""
 
     position_noise_m: float = 0.0
     velocity_noise_m_s: float = 0.0
@@ -70,11 +70,11 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class DisturbedFormation:
-    """A formation that a station flies at a loop delay, with gusts and errors of sensing.
+    """A formation flown by a station at a loop delay, with gusts and sensing errors.
 
     A, B and K are those of e' = A e + B u, u = K e; further states (`gains.performance.response.formation_loop`) follow
-    the model's. With `assumed_s` the station predicts over that loop delay. Feedback u = −w through a leader alone,
-    pushed by gusts with a correlation time of one second: the variance is 1 / (1 (1 + 1)) in continuous time.
+    the model's. With `assumed_s` the station predicts over that loop delay. A leader alone with u = −e, in gusts of
+    deviation 1 m/s² and correlation time 1 s, has the variance 1 / (1 (1 + 1)) in continuous time:
 
     >>> leader = FormationModel((-1,), axes=1)
     >>> flown = DisturbedFormation(leader, leader.A, leader.B, np.array([[-1.0]]), 0.001, 0.0, Gusts(1.0, 1.0))
@@ -88,18 +88,18 @@ class DisturbedFormation:
     K: FloatArray
     period_s: float
     delay_s: float | FloatArray
-    """Loop delay, s: of all vehicles, or of each (vehicles,). With prediction: of all."""
+    """Loop delay, s: common to all vehicles, or one for each (vehicles,). With prediction, common to all."""
     gusts: Gusts | None = None
     sensing: Sensing = Sensing()
     wind_m_s2: FloatArray | None = None
     """Steady acceleration of every vehicle, one for each axis."""
     assumed_s: float | None = None
     pushed: FloatArray | None = None
-    """What accelerations from outside do to the rates of all states, (n, inputs), as of
-    `gains.performance.response.pushed_states`; None where there are no further states."""
+    """Map (n, inputs) from external accelerations to the rates of all states, as from
+    `gains.performance.response.pushed_states`; None if there are no further states."""
     older: FloatArray | None = None
-    """(2, vehicles, vehicles): the share of the report before the newest in the position, and in the velocity, of
-    vehicle k as known at the instant of vehicle i's newest state. None if all vehicles sample at one instant."""
+    """(2, vehicles, vehicles): weight of the second newest report in the interpolated position, and in the velocity, of
+    vehicle k at the instant of vehicle i's newest state. None if all vehicles sample at one instant."""
 
     def spread(self) -> Spread:
         """The stationary spread. Raises BadModelError if the loop is not stable."""
@@ -114,7 +114,7 @@ class DisturbedFormation:
         return Spread(mean, np.sqrt(np.maximum(np.diag(covariance)[:n], 0.0)), np.sqrt(reported))
 
     def decay_1_s(self) -> float:
-        """How fast the errors decay, 1/s: the slowest root of the loop without gusts and bias."""
+        """Decay rate of the errors, 1/s: that of the slowest root of the loop without gusts and bias."""
         calm = replace(self, gusts=None, sensing=Sensing())
         return -rate_of(radius_of(calm.period_map()), self.period_s)
 
@@ -123,9 +123,9 @@ class DisturbedFormation:
         return self._lifted[0]
 
     def closed(self, z: ComplexArray) -> ComplexArray:
-        """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1): from what is added to the states after a period to the states.
+        """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1), from additions to the states after a period to the states.
 
-        G(z) is what late and held commands do; its size is that of the states, the gusts among them.
+        G(z) is the effect of late, held commands; the states include the gusts.
         """
         T, size = self.period_s, len(self._pushed.A)
         Phi, acts = self._pushed.transition(np.array([T]))[0][0], held_entry(self._pushed, z, self._late_s)
@@ -161,7 +161,7 @@ class DisturbedFormation:
 
     @cached_property
     def _push_covariance(self) -> FloatArray:
-        """What the gusts add in a period: ∫ e^{A s} W e^{A' s} ds, by the exponential of Van Loan (1978)."""
+        """Covariance added by gusts in a period: ∫ e^{A s} W e^{A' s} ds, by the exponential of Van Loan (1978)."""
         A, n = self._pushed.A, len(self.A)
         size = len(A)
         W = np.zeros((size, size))
@@ -174,7 +174,7 @@ class DisturbedFormation:
         return (covariance + covariance.T) / 2.0
 
     def _of_vehicles(self, position_m: float, velocity_m_s: float) -> FloatArray:
-        """From errors of each vehicle's position and velocity to those of e: (states, 2 inputs)."""
+        """Map (states, 2 inputs) from errors of each vehicle's position and velocity, scaled so, to errors of e."""
         model = self.model
         M = np.zeros((model.states, 2 * model.inputs))
         for i in range(model.vehicles):
@@ -197,14 +197,14 @@ class DisturbedFormation:
 
     @cached_property
     def _expected(self) -> tuple[FloatArray, dict[int, FloatArray]]:
-        """x^ = reach x_k + Σ held[j] u_{k−j}: what the station feeds back, from its own model of the plant."""
+        """(reach, held) of x^ = reach x_k + Σ held[j] u_{k−j}, the predicted state that the station feeds back."""
         n = len(self.A)
         if self.assumed_s is None:
             return np.eye(n), {}
         T, plant = self.period_s, HeldPlant(self.A, self.B, self.K, self.period_s)
         held: dict[int, FloatArray] = {}
         for age in range(1, ceil(self.assumed_s / T - 1e-9) + 1):
-            # u_{k−j} acts, as assumed, from τ^ − jT to one period later: ever since the last jT before τ^
+            # by assumption u_{k−j} acts for one period, from jT to (j − 1)T before t_k + τ^
             ends_s = np.array([min(age * T, self.assumed_s), (age - 1) * T])
             longer, shorter = plant.transition(ends_s)[1]
             held[age] = longer - shorter
@@ -212,13 +212,13 @@ class DisturbedFormation:
 
     @cached_property
     def _lifted(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """F and Q of s = (x, w, u_{k−1}, ..., ν_{k−1}, b), what a steady wind adds in a period, and e as reported.
+        """F and Q of s = (x, w, u_{k−1}, ..., ν_{k−1}, b), the effect of a steady wind in a period, and two maps.
 
-        The errors reported are those of s by the fourth matrix, and of ν_k by the fifth.
+        The reported errors are the fourth matrix times s plus the fifth times ν_k.
         """
         T, model, n = self.period_s, self.model, len(self.A)
         step, calm = self._stepped(self.K), self._stepped(np.zeros_like(self.K))
-        # what a wrong e does in a period
+        # the effect of an error in e over a period
         wrong = (step - calm)[:, : model.states]
         told, seen, noise = wrong @ self._noise, np.eye(model.states, len(step)), self._noise
         if self.older is not None and noise.any():
@@ -245,7 +245,7 @@ class DisturbedFormation:
         return step, added, steady, seen, noise
 
     def _of_older(self, share: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the noise of the reports before the newest does to the commands, and to e as reported."""
+        """Effects of the noise of the second newest reports on the commands, and on e as reported."""
         model, commands, errors = self.model, np.zeros((self.model.inputs, self._noise.shape[1])), 0.0 * self._noise
         for i in range(model.vehicles):
             seen = self._noise * np.repeat(share[:, i].ravel(), model.axes)
@@ -257,11 +257,11 @@ class DisturbedFormation:
 
     @property
     def _late_s(self) -> float | FloatArray:
-        """The loop delay of all inputs, or of each."""
+        """The loop delay common to all inputs, or one for each."""
         return np.repeat(self.delay_s, self.model.axes) if isinstance(self.delay_s, np.ndarray) else self.delay_s
 
     def _stepped(self, K: FloatArray) -> FloatArray:
-        """The map of (x, w, u_{k−1}, ...) over one period with another gain; the station believes in no gusts."""
+        """The map of (x, w, u_{k−1}, ...) over one period with another gain; the station's model has no gusts."""
         plant = replace(self._pushed, K=np.hstack([K, np.zeros((len(K), self._entry.shape[1]))]))
         if self.assumed_s is None:
             return lifted_map(plant, self._late_s)

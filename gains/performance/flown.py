@@ -1,6 +1,6 @@
 """Robustness and string stability of a formation as flown, at a loop delay.
 
-In flight a command is late by the loop delay τ and held for a control period T, which adds T/2 on average::
+In flight a command acts after the loop delay τ and is held for a control period T, which adds T/2 on average::
 
     x'(t) = A x(t) + B K_own x(t − τ_own) + B K_others x(t − τ − T/2) + w
 
@@ -8,8 +8,8 @@ In flight a command is late by the loop delay τ and held for a control period T
     onboard   τ_own is half a step of the vehicle's own loop: only the errors of other vehicles are late
 
 The loop stays stable under any disturbance |w| ≤ α |x| up to α(τ), the least singular value over all frequencies of
-its characteristic matrix (the complex stability radius). A complex disturbance of one axis is a real one of two, so no
-larger real bound exists for north and east together. The sampled loop differs in the second order of T.
+its characteristic matrix (the complex stability radius). A complex disturbance of one axis is a real one of two axes,
+so no larger real bound exists for north and east together. The sampled loop differs to second order in T.
 """
 
 from dataclasses import dataclass
@@ -27,22 +27,22 @@ from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.performance.string_stability import largest_magnitude, string_peak
 from gains.sampled.onboard import own_part
 
-# Where no α is asked for, it counts as kept down to this share of its value without delay.
+# If no α is required, α counts as kept down to this share of its value without delay.
 ALPHA_KEPT = 0.99
-# Frequencies of the first look at σ_min, and delays of the first look at how far α is kept: where there is no margin,
-# up to this many times the slowest time constant.
+# Frequencies in the first scan of σ_min; delays in the first scan for the limit of α, up to the margin or at most this
+# many times the slowest time constant.
 _FREQUENCIES, _DELAYS, _LONGEST = 400, 32, 50.0
-# α at its limit is within this share of what it is to be.
+# Relative accuracy of α at its limit.
 _ALPHA_RESOLUTION = 1e-7
-# A growth this little above the limit is rounding, and a gain this small beside k1 is none.
+# Relative growth above the limit that is rounding; relative to k1, a gain this small is zero.
 _ROUNDING, _NOTHING = 1e-9, 1e-12
 
 
 @dataclass(frozen=True)
 class FlownTiming:
-    """When feedback acts in flight.
+    """Timing of the feedback in flight.
 
-    A hold of 20 ms delays by 10 ms; on board a vehicle feeds back its own errors at once:
+    A hold of 20 ms adds a delay of 10 ms; on board a vehicle feeds back its own errors without delay:
 
     >>> FlownTiming(0.3, 0.02).delays_s(0.1), FlownTiming(0.3, 0.02, "onboard").delays_s(0.1)
     ((0.11, 0.11), (0.0, 0.11))
@@ -51,14 +51,14 @@ class FlownTiming:
     delay_margin_s: float
     """Least loop delay (s) at which the loop as flown is unstable; `inf` if there is none."""
     period_s: float
-    """Control period T: commands are held for it."""
+    """Control period T, for which commands are held."""
     loop: Literal["ground", "onboard"] = "ground"
     """Where the vehicles' own loops are closed."""
     step_s: float = 0.0
     """Period of the loop on board."""
 
     def delays_s(self, delay_s: float) -> tuple[float, float]:
-        """Delays of a vehicle's own errors and of those of others at a loop delay (s), holds included."""
+        """Delays (s) of a vehicle's own errors and of those of others at a loop delay (s), including holds."""
         late_s = delay_s + self.period_s / 2.0
         return (self.step_s / 2.0 if self.loop == "onboard" else late_s), late_s
 
@@ -67,9 +67,9 @@ class FlownTiming:
 class FlownFormation:
     """A formation flown by a station with the gain K (inputs, states) of u = K e.
 
-    Its `responses` are in the order of the model; without them vehicles answer at once.
+    Its `responses` are in the order of the model; without them vehicles respond at once.
 
-    A vehicle alone: σ_min is |jω + e^{−jωτ}|, least where the phase of the loop is nearest to −π:
+    For a vehicle alone σ_min is |jω + e^{−jωτ}|, least where the phase of the loop is closest to −π:
 
     >>> lone = FlownFormation(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.pi / 2, period_s=0.0))
     >>> [round(lone.alpha(delay_s), 3) for delay_s in (0.0, 1.0, 1.5)]
@@ -88,7 +88,7 @@ class FlownFormation:
         return -highest(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())[1]
 
     def alpha_limit_s(self, alpha: float) -> float:
-        """The largest loop delay up to which α is kept: `inf` if at every one, 0 if not even without delay."""
+        """The largest loop delay (s) up to which α is kept; `inf` if at every delay, 0 if not even without delay."""
         margin_s, omega = self.timing.delay_margin_s, self.frequencies()
         longest_s = min(margin_s, _LONGEST / self._slowest)
         delays = np.linspace(0.0, longest_s, _DELAYS, endpoint=False).tolist()
@@ -100,24 +100,24 @@ class FlownFormation:
         if first == _DELAYS and margin_s == inf:
             return inf
         ends = [(delay_s, self.alpha(delay_s) - alpha) for delay_s in (delays[first - 1], [*delays, longest_s][first])]
-        if ends[0][1] < 0.0:  # a valley between the frequencies looked at first
+        if ends[0][1] < 0.0:  # the first scan missed a valley between frequencies
             ends = [(0.0, at_rest), ends[0]]
         return met_end(lambda delay_s: self.alpha(delay_s) - alpha, *ends, resolution=_ALPHA_RESOLUTION * alpha)
 
     def frequencies(self) -> FloatArray:
-        """Frequencies (rad/s) that show every valley of σ_min. Beyond the last one σ_min is larger than at rest."""
+        """Frequencies (rad/s) that show every valley of σ_min. Beyond the last one σ_min is larger than at ω = 0."""
         highest = 4.0 * float(spectral_norms(np.stack(self._matrices)).sum())
         return np.concatenate([[0.0], np.geomspace(self._slowest * 1e-2, highest, _FREQUENCIES)])
 
     def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
-        """σ_min of the characteristic matrix at each frequency, with a loop delay (s)."""
+        """σ_min of the characteristic matrix at each frequency, for a loop delay (s)."""
         sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
         return sigma[:, -1].astype(np.float64)
 
     def characteristic(self, omega: FloatArray, delay_s: float) -> ComplexArray:
         """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.
 
-        Of one axis if the gains act on every axis alike, which is as large as that of all of them.
+        If the gains act on every axis alike, it is that of one axis, which has the same singular values.
         """
         A, own, others = self._matrices
         own_s, late_s = self.timing.delays_s(delay_s)
@@ -143,7 +143,7 @@ class FlownFormation:
         return float(max(magnitudes.min(), 1e-6 * magnitudes.max()))
 
     def _answers(self, omega: FloatArray) -> ComplexArray:
-        """From wanted to real accelerations, (k, n, 1): the factor of each row of B K."""
+        """Factor (k, n, 1) of each row of B K, from commanded to real accelerations."""
         model, _ = self._narrowed
         factors = np.ones((len(omega), model.states, 1), dtype=np.complex128)
         for vehicle, response in enumerate(self.responses or ()):
@@ -153,12 +153,12 @@ class FlownFormation:
 
 @dataclass(frozen=True)
 class FlownLoop:
-    """One follower behind another, flown by a station, which stands for all followers of a tree with equal gains.
+    """A follower behind another, flown by a station; it represents all followers of a tree with equal gains.
 
-    `gains` are k1, k2 and k3, which act on every axis alike; their α is not used. The vehicle answers at once if it has
-    no `response`.
+    `gains` are k1, k2 and k3, which act on every axis alike; their α is not used. Without a `response`, the vehicle
+    responds at once.
 
-    A loop with a margin of 0.71 s, whose errors grow more the nearer it comes:
+    A loop with a margin of 0.71 s, in which errors grow more as the delay approaches it:
 
     >>> loop = FlownLoop(ScalarGains(1.0, 0.0, 1.0, 0.0), FlownTiming(delay_margin_s=0.711119, period_s=0.0))
     >>> [round(loop.string_peak(delay_s), 2) for delay_s in (0.0, 0.4, 0.6)]
@@ -173,7 +173,7 @@ class FlownLoop:
 
     @cached_property
     def pair(self) -> FlownFormation:
-        """The follower and the vehicle in front as a formation of one axis, which has the α of all axes."""
+        """The follower and the vehicle in front as a formation of one axis, which has the same α as all axes."""
         responses = None if self.response is None else (self.response, self.response)
         return FlownFormation(PAIR, self.gains.K, self.timing, responses)
 
@@ -189,13 +189,13 @@ class FlownLoop:
     def string_limit_s(self, peak: float) -> float:
         """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
 
-        `inf` if that holds at every delay, 0 if not even without. In closed form at each frequency: one part of
-        Γ = N / D turns by e^{−jθ}, θ = ωτ, as the delay grows, so that |N|² ≤ peak² |D|² is cos(θ + ψ) ≥ c, which holds
+        `inf` if that holds at every delay, 0 if not even without delay. In closed form at each frequency: one part of
+        Γ = N / D rotates by e^{−jθ}, θ = ωτ, as the delay grows, so |N|² ≤ peak² |D|² is cos(θ + ψ) ≥ c. This holds
         from |ψ| ≤ acos c up to θ = acos c − ψ. The least θ / ω is the limit.
         """
         k1, k2, k3 = self._k
         own_s, hold_s = self.timing.delays_s(0.0)
-        # |N|² − |D|² is k2² + 2 k2 k3 (front − own delay) + 2 k3 − k1² times ω² at low frequencies, too flat to see
+        # at low frequencies |N|² − |D|² is k2² + 2 k2 k3 (front − own delay) + 2 k3 − k1² times ω², too flat to sweep
         spare = k1**2 - k2**2 - 2 * k3
         if abs(spare) <= _ROUNDING * k1**2:
             spare = 0.0
@@ -212,13 +212,13 @@ class FlownLoop:
         return min(limit_s, self.timing.delay_margin_s) if limit_s > _ROUNDING else 0.0
 
     def _turn(self, omega: FloatArray, peak: float, spare: float) -> FloatArray:
-        """ω / θ, 1 over the loop delay up to which the growth at a frequency is within `peak`."""
+        """ω / θ, the reciprocal of the loop delay up to which the growth at a frequency is within `peak`."""
         k1, k2, k3 = self._k
         x, h = omega**2, self._answer(omega)
         power = np.real(h * np.conj(h))
         level = peak**2
         own_s, hold_s = self.timing.delays_s(0.0)
-        # what |N|² and peak² |D|² differ by beside the part that turns, exact for small ω
+        # difference of |N|² and peak² |D|² apart from the rotating part, exact for small ω
         flat = (level - 1.0) * k3**2 + x * ((level - 1.0) * k1**2 + spare + 2 * k3)
         own = (1j * k1 * omega + k3) * h
         if self.timing.loop == "ground":

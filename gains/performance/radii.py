@@ -1,21 +1,21 @@
-"""How large a disturbance w = Δ e a formation in flight takes before it is unstable: stability radii at a loop delay.
+"""Stability radii at a loop delay: the least disturbance w = Δ e that makes a formation in flight unstable.
 
-The loop is sampled and held, as in `gains.performance.disturbed`. Every period a disturbance is computed from the true
-errors of some vehicles, w_k = Δ e_k, and pushes e' = A e + B u + w until the next (3.20-3.24). With M(z) from w to e,
-the loop is unstable from that size |Δ| on at which det(I − M(z) Δ) = 0 somewhere on the unit circle:
+The loop is sampled and held, as in `gains.performance.disturbed`. In every period a disturbance is computed from the
+true errors of some vehicles, w_k = Δ e_k, and acts on e' = A e + B u + w until the next (3.20-3.24). With M(z) from w
+to e, the radius is the least size |Δ| at which det(I − M(z) Δ) = 0 somewhere on the unit circle:
 
-    complex radius   1 / max σ_1(M)     Δ may be any stable filter: it turns the phase of each error at will
+    complex radius   1 / max σ_1(M)     Δ may be any stable filter, with any phase for each error
     real radius      1 / max μ_R(M)     Δ is a constant matrix, the same on each axis
 
     μ_R(M) = inf over 0 < γ ≤ 1 of σ_2 [[Re M, −γ Im M], [Im M / γ, Re M]],
 
 by the formula of Qiu, Bernhardsson, Rantzer, Davison, Young and Doyle, "A formula for computation of the real stability
-radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). Of a single error, M is a number: μ_R is |M| where M is
-real, and 0 elsewhere. A constant Δ that couples two axes acts as a complex one of one axis, so the complex radius is
+radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). For a single error M is a number: μ_R is |M| where M is
+real, and 0 elsewhere. A constant Δ that couples two axes acts like a complex one on one axis, so the complex radius is
 also that of constant disturbances of north and east together.
 
-The worst Δ comes with either radius. The complex one has rank one, and first-order all-pass filters (c + 1/z) /
-(1 + c/z) give each of its entries the phase that it has at the worst frequency, so its size is the same at all others.
+Both radii are returned with the worst Δ. The complex one has rank one, and first-order all-pass filters (c + 1/z) /
+(1 + c/z) give its entries their phases at the worst frequency, so its size is the same at all other frequencies.
 """
 
 from dataclasses import dataclass
@@ -29,26 +29,26 @@ from gains.core.errors import BadModelError
 from gains.performance.disturbed import DisturbedFormation
 from gains.sampled._loop import HeldPlant
 
-# angles per period of the first look, the least of them, and the range of log γ
+# number of angles in the first scan, the least of them, and the lower end of log γ
 _ANGLES, _LEAST_ANGLE, _LEAST_LOG_GAMMA = 400, 1e-5, -14.0
 _GAMMAS = 25
-# angles per radian that late commands turn M, and the places beside each resonance in units of its width
+# angles per radian by which late commands rotate M; offsets from each resonance in units of its width
 _PER_RADIAN, _BESIDE = 8, np.concatenate([way * 2.0 ** np.arange(-3.0, 10.0) for way in (-1.0, 1.0)])
-# entries of the worst disturbance this small beside its largest are none
+# entries this small in the unit vectors of the worst disturbance are zero
 _NOTHING = 1e-9
 _ROTATIONS = 180
 
 
 @dataclass(frozen=True, eq=False)
 class Worst:
-    """A stability radius, and the disturbance of that size which makes the loop unstable.
+    """A stability radius, and a disturbance of that size that makes the loop unstable.
 
-    w = radius · out(z) D in(z) e, with D = `direction` of norm one, and all-pass filters for each column and row: their
-    coefficients c, of which 1 passes an error on as it is.
+    w = radius · out(z) D in(z) e, with D = `direction` of norm one, and the coefficients c of an all-pass filter for
+    each column (in) and row (out); c = 1 leaves an error unchanged.
     """
 
     radius_1_s: float
-    """`inf` if no disturbance of these errors makes the loop unstable, and the others are then empty."""
+    """`inf` if no disturbance of these errors makes the loop unstable; the others are then empty."""
     frequency_rad_s: float
     direction: FloatArray
     all_pass_in: tuple[float, ...] = ()
@@ -57,9 +57,9 @@ class Worst:
 
 @dataclass(frozen=True, eq=False)
 class SectorLoop:
-    """The loop of a formation of one axis, and the errors (places in e) from which w is computed and on which it acts.
+    """The loop of a formation of one axis, and the errors (indices in e) from which w is computed and on which it acts.
 
-    A vehicle alone, x' = −x + w sampled at 1 kHz, is unstable from w = x on:
+    A vehicle alone, x' = −x + w sampled at 1 kHz, becomes unstable at w = x:
 
     >>> from gains.formation.model import FormationModel
     >>> leader = FormationModel((-1,), axes=1)
@@ -74,7 +74,7 @@ class SectorLoop:
     """W of w = Δ W e, (errors, errors); None for the identity."""
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
-        """M at frequencies (k,): from a held w to e, weighted, (k, errors, errors)."""
+        """M at frequencies (k,), from a held w to weighted e, (k, errors, errors)."""
         z = np.exp(1j * omega_rad_s * self.formation.period_s)[:, np.newaxis, np.newaxis].astype(np.complex128)
         chosen = list(self.errors)
         M = (self.formation.closed(z)[:, chosen] @ self._entry).astype(np.complex128)
@@ -117,7 +117,7 @@ class SectorLoop:
         return Worst(1.0 / peak, omega, direction)
 
     def _real_radius_of_one(self, ends: FloatArray) -> Worst:
-        """That of a single error: M is real at the ends, and where its imaginary part changes sign on a fine grid."""
+        """Real radius for a single error: M is real at the ends, and where Im M changes sign on a fine grid."""
 
         def imaginary(omega: FloatArray) -> FloatArray:
             return self.response(omega)[:, 0, 0].imag
@@ -142,7 +142,7 @@ class SectorLoop:
 
     @property
     def _entry(self) -> FloatArray:
-        """What a held w of these errors does to the states in one period, (states, errors)."""
+        """Effect of a held w of these errors on the states over one period, (states, errors)."""
         formation = self.formation
         size, T = len(formation.A), formation.period_s
         if formation.gusts is not None:
@@ -151,7 +151,7 @@ class SectorLoop:
         return HeldPlant(formation.A, acts, acts.T, T).transition(np.array([T]))[1][0]
 
     def _peak(self, function: Functions, more: FloatArray, values: FloatArray) -> tuple[float, float]:
-        """Frequency and height of the largest value, local maxima refined; `more` frequencies have known values."""
+        """Frequency and height of the largest value, local maxima refined; at `more` frequencies values are given."""
         T = self.formation.period_s
         grid = np.geomspace(_LEAST_ANGLE, pi * (1.0 - 1e-9), _ANGLES) / T
         grid = np.unique(np.concatenate([[0.0] if not more.size else [], grid, self._resonances()]))
@@ -159,13 +159,13 @@ class SectorLoop:
         return max([*known, highest(function, grid)], key=lambda each: each[1])
 
     def _resonances(self) -> FloatArray:
-        """The frequencies (rad/s) of the loop's own motions, where narrow peaks are."""
+        """Frequencies (rad/s) of the loop's own motions, where peaks may be narrow."""
         z = np.linalg.eigvals(self.formation.period_map())
         omega = np.abs(np.angle(z[np.abs(z) > 0.5])) / self.formation.period_s
         return omega[(omega > 0.0) & (omega < (1.0 - 1e-9) * pi / self.formation.period_s)]
 
     def _filtered(self, radius: float, omega: float, left: ComplexArray, right: ComplexArray) -> Worst:
-        """v u* of rank one as all-pass filters at an angle: a phase common to both is free, and keeps them fast."""
+        """The rank-one v u* as all-pass filters at an angle; a free common phase is chosen to make them fast."""
         angle = omega * self.formation.period_s
         sizes = np.outer(np.abs(right), np.abs(left))
         if angle == 0.0 or angle >= pi * (1.0 - 1e-6):
@@ -192,7 +192,7 @@ def _all_pass(phase: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _doubled(M: ComplexArray, gamma: FloatArray) -> FloatArray:
-    """[[Re M, −γ Im M], [Im M / γ, Re M]] for each of (k,)."""
+    """[[Re M, −γ Im M], [Im M / γ, Re M]] for each of M (k, n, n) and γ (k,)."""
     g = gamma[:, np.newaxis, np.newaxis]
     above = np.concatenate([M.real, -g * M.imag], axis=2)
     return np.concatenate([above, np.concatenate([M.imag / g, M.real], axis=2)], axis=1)
@@ -219,8 +219,8 @@ def _worst_constant(M: ComplexArray, gamma: float) -> FloatArray:
     """The real Δ of least norm with det(I − M Δ) = 0, scaled to norm one.
 
     With P v = σ u, M (v_1 + jγ v_2) = σ (u_1 + jγ u_2): Δ takes σ u_1 to v_1 and σ u_2 to v_2. It has the norm 1 / σ if
-    |u_1| = |v_1| and u_1'u_2 = v_1'v_2. The first holds where σ_2 is stationary in γ, or for some vector between those
-    of two singular values that meet in the minimum; the second follows from P v = σ u and P'u = σ v.
+    |u_1| = |v_1| and u_1'u_2 = v_1'v_2. The first holds where σ_2 is stationary in γ, or for some combination of the
+    vectors of two singular values that meet in the minimum; the second follows from P v = σ u and P'u = σ v.
     """
     left, values, right = np.linalg.svd(_doubled(M[np.newaxis], np.array([gamma]))[0])
     n, pair = len(M), 0 if values[0] - values[1] < values[1] - values[2] else 2
@@ -228,7 +228,7 @@ def _worst_constant(M: ComplexArray, gamma: float) -> FloatArray:
     def excess(j: int, k: int) -> float:
         return float(left[:n, j] @ left[:n, k] - right[j, :n] @ right[k, :n])
 
-    # turned by t within the pair: excess(1, 1) cos² t + 2 excess(1, pair) cos t sin t + excess(pair, pair) sin² t = 0
+    # rotated by t in the pair: excess(1, 1) cos² t + 2 excess(1, pair) cos t sin t + excess(pair, pair) sin² t = 0
     single, both, other = excess(1, 1), excess(1, pair), excess(pair, pair)
     size, turn = np.hypot((single - other) / 2.0, both), np.arctan2(both, (single - other) / 2.0)
     opening = np.arccos(np.clip(-(single + other) / (2.0 * size), -1.0, 1.0)) if size > 0.0 else 0.0

@@ -1,16 +1,16 @@
-"""The formation loop of vehicles that respond to a command as an autopilot does, and its delay margin.
+"""The formation loop of vehicles that respond to commands like an autopilot, and its delay margin.
 
-A vehicle is commanded an acceleration u and the velocity that goes with it, v_s' = u. Its acceleration a follows what
-its velocity loop wants, w = u + g (v_s - v), with one of three responses h = a / w:
+A vehicle is commanded an acceleration u and the corresponding velocity, v_s' = u. Its acceleration a follows the demand
+of its velocity loop, w = u + g (v_s - v), with one of three responses h = a / w:
 
     lag                  lag a'(t) = w(t) - a(t)                     h = 1 / (lag s + 1)
     lag with dead time   lag a'(t) = w(t - T) - a(t)                 h = e^{-sT} / (lag s + 1)
     second order         a'' / omega_n^2 + lag a' = w - a            h = 1 / (s^2 / omega_n^2 + lag s + 1)
 
 so that v' = a and a / u = h (s + g) / (s + g h), which is h for g = 0. Instead of v_s the state holds the velocity
-still owed, d = v_s - v, d' = u - a. A dead time becomes a rational function of order 4, whose phase is exact to 1e-6
-rad up to an angle of omega T = 1.3; `Response.transfer` has it exactly. With these A, B and u = K e,
-`gains.delay.constant` and `gains.sampled.multirate` have the margin.
+deficit d = v_s - v, d' = u - a. A dead time becomes a rational function of order 4, whose phase is exact to 1e-6 rad up
+to an angle of omega T = 1.3; `Response.transfer` models it exactly. With these A, B and u = K e, `gains.delay.constant`
+and `gains.sampled.multirate` compute the margin.
 """
 
 from collections.abc import Sequence
@@ -26,23 +26,23 @@ from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing, multirate_delay_margin
 
 _ORDER = 4
-"""Of the rational function that stands for a dead time (Pade)."""
+"""Order of the rational function (Pade) that approximates a dead time."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """The response of one vehicle: its `lag_s` > 0 from wanted to real acceleration, and its velocity gain g >= 0.
+    """The response of one vehicle: its `lag_s` > 0 from demanded to real acceleration, and its velocity gain g >= 0.
 
-    BadModelError if the lag is below 1e-6 s, the gain or the dead time negative, the natural frequency not positive,
-    any not finite, or if there are both a dead time and a natural frequency.
+    BadModelError if the lag or the natural frequency is below 1e-6, the gain or the dead time is negative, any of them
+    is not finite, or both a dead time and a natural frequency are given.
     """
 
     lag_s: float
-    """Time constant; of a second order, 2 damping / natural frequency: its phase at low frequencies is the same."""
+    """Time constant; for second order, 2 damping / natural frequency, which has the same phase at low frequencies."""
     velocity_gain_1_s: float
     dead_time_s: float = 0.0
     natural_frequency_rad_s: float | None = None
-    """Of a second order; None for the other models."""
+    """Natural frequency of a second-order response; None for the other models."""
 
     def __post_init__(self) -> None:
         natural = self.natural_frequency_rad_s
@@ -63,11 +63,11 @@ class Response:
 
     @property
     def damping(self) -> float | None:
-        """Damping ratio of a second order; None for the other models."""
+        """Damping ratio of a second-order response; None for the other models."""
         return None if self.natural_frequency_rad_s is None else self.lag_s * self.natural_frequency_rad_s / 2.0
 
     def transfer(self, omega: FloatArray) -> ComplexArray:
-        """a / u at jω, from wanted to real acceleration: h (s + g) / (s + g h)."""
+        """a / u at jω, from commanded to real acceleration: h (s + g) / (s + g h)."""
         s, g = 1j * omega, self.velocity_gain_1_s
         below = self.lag_s * s + 1.0
         if self.natural_frequency_rad_s is not None:
@@ -79,11 +79,11 @@ class Response:
 
 
 def own_dynamics(response: Response) -> tuple[FloatArray, FloatArray]:
-    """Return (A, B) of one vehicle of one axis: the state is its acceleration a, what follows it, and d if g > 0.
+    """Return (A, B) of one vehicle on one axis: the state is its acceleration a, internal states, and d if g > 0.
 
     The input is u.
 
-    A lag of 0.5 s and a gain of 2 1/s: 0.5 a' = u + 2 d - a, d' = u - a.
+    A lag of 0.5 s and a gain of 2 1/s give 0.5 a' = u + 2 d - a, d' = u - a:
 
     >>> [matrix.tolist() for matrix in own_dynamics(Response(0.5, 2.0))]
     [[[-2.0, 4.0], [-1.0, 0.0]], [[2.0], [1.0]]]
@@ -124,12 +124,12 @@ def formation_loop(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return (A, B, K) of the formation u = K e whose vehicles have these responses, one for each in the model's order.
 
-    Without responses they respond at once, and these are the model's own.
+    Without responses the vehicles respond at once, and A, B and K are those of the model.
 
-    The state is e of `gains.formation.model`, followed by that of each vehicle as of `own_dynamics`, axis by axis.
+    The state is e of `gains.formation.model`, followed by each vehicle's state of `own_dynamics`, axes interleaved.
     BadModelError unless K has the shape (inputs, states) of the model and there is one response for each vehicle.
 
-    A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
+    A leader alone on one axis, with e' = a, 0.5 a' = u − a, u = −e:
 
     >>> A, B, K = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(0.5, 0.0)])
     >>> (A + B @ K).tolist()
@@ -158,7 +158,7 @@ def formation_loop(
 
 
 def response_states(model: FormationModel, responses: Sequence[Response]) -> list[slice]:
-    """Which states of `formation_loop` are those of each vehicle's response.
+    """The slice of the states of `formation_loop` that belongs to each vehicle's response.
 
     >>> response_states(FormationModel((-1, 0), axes=1), [Response(0.5, 0.0), Response(0.5, 2.0)])
     [slice(3, 4, None), slice(4, 6, None)]
@@ -169,9 +169,9 @@ def response_states(model: FormationModel, responses: Sequence[Response]) -> lis
 
 
 def pushed_states(model: FormationModel, responses: Sequence[Response]) -> FloatArray:
-    """What accelerations of the vehicles from outside (inputs,) do to the rates of the states of `formation_loop`.
+    """Map from external accelerations of the vehicles (inputs,) to the rates of the states of `formation_loop`.
 
-    They act on the velocity errors, and on the velocity still owed: v' = a + w and d' = u − a − w.
+    They act on the velocity errors and on the velocity deficit: v' = a + w and d' = u − a − w.
 
     >>> pushed_states(FormationModel((-1,), axes=1), [Response(0.5, 2.0)]).tolist()
     [[1.0], [0.0], [-1.0]]
@@ -190,10 +190,10 @@ def sampled_margin(
 ) -> float:
     """Return the least loop delay (s) at which the sampled and held loop of these vehicles loses stability.
 
-    Without responses they respond at once. Arguments and exceptions as of `formation_loop` and
+    Without responses they respond at once. Arguments and exceptions as for `formation_loop` and
     `gains.sampled.multirate.multirate_delay_margin`.
 
-    The leader of `continuous_margin`, sampled: 1.1506 s less half a period or so.
+    The leader of `continuous_margin`, sampled, has about 1.1506 s less half a period:
 
     >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
     >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)
@@ -205,9 +205,9 @@ def sampled_margin(
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
     """Return the least delay (s) at which the continuous loop of these vehicles loses stability.
 
-    Arguments and exceptions as of `formation_loop` and `gains.delay.constant.delay_margin`.
+    Arguments and exceptions as for `formation_loop` and `gains.delay.constant.delay_margin`.
 
-    A leader with s (s + 1) + e^{−sτ} = 0: ω² (1 + ω²) = 1 and τ = (π/2 − atan ω) / ω.
+    A leader with s (s + 1) + e^{−sτ} = 0 has ω² (1 + ω²) = 1 and τ = (π/2 − atan ω) / ω:
 
     >>> round(continuous_margin(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(1.0, 0.0)]), 4)
     1.1506

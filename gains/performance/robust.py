@@ -1,7 +1,7 @@
-"""How robust given gains are: exactly, by frequency response, and proved, by a Lyapunov function.
+"""Robustness of given gains: exact, by frequency response, and proved, by a Lyapunov function.
 
 The subsystem E = (e_j^v, e_i^p, e_i^v) of a follower i behind j is disturbed by w (wind, model error) within a sector,
-w'w ≤ α² E'W'W E (3.25-3.29). Every follower has the same subsystem, so nothing here grows with the number of vehicles.
+w'w ≤ α² E'W'W E (3.25-3.29). All followers have the same subsystem, so nothing here grows with the number of vehicles.
 α is in 1/s for W = I with the state in m and m/s.
 
 Source: Sahoo 2012 (see `gains.formation.model`), eqs. (3.20)-(3.29).
@@ -18,16 +18,16 @@ from gains.core.structure import real_matrix
 from gains.formation.model import FormationModel
 
 # The level-set search stops when no frequency exceeds the largest gain found by this share: far above the rounding of a
-# 6×6 eigenvalue problem, and far below what any figure shown to a user resolves.
+# 6×6 eigenvalue problem, and far below the resolution of any figure shown to a user.
 _LEVEL_STEP = 1e-10
 _LEVEL_ROUNDS = 60
-# by this share the Riccati equation asks for more than α, in every direction
+# relative slack ε by which the Riccati equation demands more than α, in every direction
 _SLACK = 4e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Lyapunov function V = E'PE that proves the sector bound α, with the eigenvalues that were checked."""
+    """Lyapunov function V = E'PE that proves the sector bound α, with its checked eigenvalues."""
 
     P: FloatArray
     """Symmetric, shape (3 n, 3 n)."""
@@ -42,7 +42,7 @@ class Certificate:
 def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
     """Return the closed loop A_cl = [[K1, 0, 0], [I, 0, −I], [K2, K3, K1]] of (3.25, 3.26), shape (3 n, 3 n).
 
-    It is that of a leader and one follower. Arguments and exceptions as of `robustness`.
+    It is the loop of a leader and one follower. Arguments and exceptions as for `robustness`.
     """
     given = {"K1": K1, "K2": K2, "K3": K3}
     gains = [real_matrix(name, np.atleast_2d(np.asarray(gain))) for name, gain in given.items()]
@@ -51,13 +51,13 @@ def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
 
 
 def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None = None) -> float:
-    """Return the exact α of the gains: 1 / ‖W (sI − A_cl)^{-1}‖∞, and 0 if the loop without disturbance is not stable.
+    """Return the exact α of the gains, 1 / ‖W (sI − A_cl)^{-1}‖∞; 0 if the undisturbed loop is not stable.
 
-    A quadratic Lyapunov function, with a full matrix, that proves the sector bound α exists if and only if α ‖W (sI −
-    A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I this is the complex stability radius of A_cl, the least of
-    σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes. K1, K2 and K3 have the shape (n, n), or are
-    numbers; the weight W of the sector has the shape (q, 3 n), the identity if not given. BadModelError if one is not
-    finite or of another shape.
+    The sector bound α can be proved by a quadratic Lyapunov function, with a full matrix, if and only if
+    α ‖W (sI − A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I, 1 / ‖·‖∞ is the complex stability radius of A_cl,
+    the minimum of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes. K1, K2 and K3 have the shape
+    (n, n), or are numbers; the weight W of the sector has the shape (q, 3 n), the identity if None. BadModelError if
+    one is not finite or has another shape.
 
     These gains are weakest at ω = 0, where α is the least singular value of A_cl:
 
@@ -74,9 +74,9 @@ def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
 
     A and W are finite, of shapes (n, n) and (q, n).
 
-    γ is a singular value of W (jωI − A)^{-1} if and only if jω is an eigenvalue of [[A, I/γ], [−W'W/γ, −A']]. From a
-    lower bound γ, the frequencies at which the level is crossed bound the intervals above it; the response at their
-    middles gives the next γ, until no crossing is left. The result is on the safe side by at most 1e-10 of itself.
+    γ is a singular value of W (jωI − A)^{-1} if and only if jω is an eigenvalue of [[A, I/γ], [−W'W/γ, −A']]. Given a
+    lower bound γ, the frequencies at which the response crosses it bound the intervals above it; the response at their
+    midpoints gives the next γ, until no crossing is left. The result is on the safe side by at most 1e-10 of itself.
 
     x' = −2 x + w stays stable for w² ≤ α² x² up to α = 2:
 
@@ -99,8 +99,8 @@ def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
         gamma = peak * (1 + _LEVEL_STEP)
         hamiltonian = np.block([[A, identity / gamma], [-weight_squared / gamma, -A.T]])
         crossing = np.linalg.eigvals(hamiltonian)
-        # A crossing that is nearly a touch splits off the axis by the root of the rounding error. Taking too many is
-        # harmless: they only name frequencies at which the response is then computed.
+        # A crossing that is nearly a touch leaves the axis by the square root of the rounding error. Taking too many is
+        # harmless: they are only frequencies at which the response is then computed.
         on_axis = np.abs(crossing.real) <= 1e-6 * np.abs(crossing).max()
         levels = np.unique(np.abs(crossing.imag[on_axis]))
         if levels.size == 0:
@@ -110,13 +110,13 @@ def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
 
 
 def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayLike | None = None) -> Certificate:
-    """Prove that the gains withstand the sector bound α: a full P from a Riccati equation, checked by eigenvalues.
+    """Prove that the gains withstand the sector bound α, by a full P from a Riccati equation, checked by eigenvalues.
 
-    P is the stabilising solution of A_cl'P + P A_cl + P P + (1 + ε) α² W'W + ε α² I = 0 with ε = 4e-5, so that the
-    S-procedure matrix [[A_cl'P + P A_cl + α² W'W, P], [P, −I]] is negative definite. It exists for α up to about ε of
-    itself below the exact bound of `robustness`, which is found in another way. Gains and W as of `robustness`. Raises
-    BadModelError if α is not positive or a gain or W not finite or of its shape, and InfeasibleError if the equation
-    has no such solution or P fails the check.
+    P is the stabilising solution of A_cl'P + P A_cl + P P + (1 + ε) α² W'W + ε α² I = 0 with ε = 4e-5, which makes the
+    S-procedure matrix [[A_cl'P + P A_cl + α² W'W, P], [P, −I]] negative definite. It exists for α up to a relative
+    distance of about ε below the exact bound of `robustness`, which is found in another way. Gains and W as for
+    `robustness`. Raises BadModelError if α is not positive, or a gain or W is not finite or has a wrong shape, and
+    InfeasibleError if the equation has no such solution or P fails the check.
     """
     if not (np.isfinite(alpha) and alpha > 0):
         raise BadModelError(f"alpha = {alpha}; wanted a positive number")
@@ -143,7 +143,7 @@ def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
 
 
 def _checked_certificate(A: FloatArray, W: FloatArray, alpha: float, P: FloatArray) -> Certificate:
-    """Check P ≻ 0 and the S-procedure matrix ≺ 0 by numpy's eigenvalues alone, with room for their rounding."""
+    """Check P ≻ 0 and the S-procedure matrix ≺ 0 by numpy's eigenvalues alone, allowing for their rounding."""
     P_ = (P + P.T) / 2
     s_procedure = np.block([[A.T @ P_ + P_ @ A + alpha**2 * W.T @ W, P_], [P_, -np.eye(A.shape[0])]])
     P_min = float(np.linalg.eigvalsh(P_).min())

@@ -18,9 +18,9 @@ from gains.core.errors import BadModelError
 Gains = tuple[FloatArray, FloatArray, FloatArray]
 """K1, K2 and K3, each of shape (axes, axes)."""
 Transfer = Callable[[FloatArray], ComplexArray]
-"""Frequencies (k,) in rad/s to the values (k,) of a transfer function."""
+"""Maps frequencies (k,) in rad/s to the values (k,) of a transfer function."""
 
-# The sweep of a peak: frequencies in each of its decades.
+# Grid of a sweep for a peak: frequencies per decade, and decades below and above a given frequency.
 _POINTS_PER_DECADE, _DECADES_BELOW, _DECADES_ABOVE = 300, 4, 2
 
 
@@ -35,13 +35,13 @@ def string_peak(
     """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1.
 
     Γ takes the velocity error of the vehicle in front to the follower's own and, for gains that act on every axis
-    alike, also the spacing error in front to the follower's own. With own feedback delayed by a and that of the vehicle
-    in front by b::
+    alike, also the spacing error in front to the follower's own. If a vehicle's own errors are delayed by a, and the
+    velocity error of the vehicle in front by b::
 
         Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} ((s K2 e^{−sb} + K3 e^{−sa}) h + s² k_ff I)
 
-    a is `delay_s` and b `front_delay_s`, the same if not given, as when a ground station closes every loop. h(jω) is
-    `answer`, from wanted to real acceleration; k_ff is `feed_forward`, the share of the command in front that is added.
+    a is `delay_s` and b is `front_delay_s`, by default the same, as when a ground station closes every loop. h(jω) is
+    `answer`, from commanded to real acceleration; k_ff is `feed_forward`, the added share of the command in front.
 
     |1 / (s² + s + 1)| peaks at 2 / √3:
 
@@ -70,10 +70,10 @@ def string_peak(
 
 
 def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_rad_s: float) -> float:
-    """Return the largest magnitude of a response (k,) to frequencies (k,), from a sweep whose maxima are refined.
+    """Return the largest magnitude of a frequency response, from a sweep whose maxima are refined.
 
-    The sweep goes from four decades below `near_rad_s`, a frequency around which the response changes, to two above.
-    BadModelError if that is not a positive number.
+    `response` maps frequencies (k,) to values (k,). The sweep goes from four decades below `near_rad_s`, a frequency
+    near which the response changes, to two above. BadModelError if `near_rad_s` is not a positive finite number.
 
     >>> round(largest_magnitude(lambda omega: omega / (1 - omega**2 + 1j * omega), near_rad_s=3.0), 9)  # at 1 rad/s
     1.0

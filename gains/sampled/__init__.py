@@ -1,1 +1,1 @@
-"""Loops as they are flown: sampled and held, at two rates, or with a loop on board. Begin at `constant`."""
+"""Loops as flown: sampled and held, at two rates, or with a loop on board. Begin at `constant`."""

@@ -8,25 +8,25 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gains.delay._loci import delay_loci, swept_crossings, unit_gain_roots
 from gains.sampled._loop import HeldPlant
 
-# rad by which a delayed term turns between neighbouring frequencies, and the least number of them
+# rotation (rad) of a delayed term between neighbouring frequencies, and the least number of frequencies
 _TURN, _LEAST = 0.1, 200
-# frequencies added to even ones: shares of the highest; and beside a pole, in half-widths of its resonance
+# frequencies added to an even grid: fractions of the highest, and offsets from a pole in half-widths of its resonance
 _LOW, _BESIDE_POLE = np.logspace(-5.0, 0.0, 80), np.sinh(np.linspace(-4.0, 4.0, 17))
 
 
 def highest_crossing(plant: HeldPlant, assumed_s: float) -> float:
-    """A frequency (rad/s) above which `continuous_crossings` has none, 0 if there is none at all."""
+    """Bound (rad/s) on the frequencies of `continuous_crossings`; 0 if there are no crossings."""
     loop, carried = plant.A + plant.B @ plant.K, plant.K @ plant.carry(np.array([assumed_s]))[0]
     gain, scale = unit_gain_roots(loop, plant.B, 2.0 * carried), float(np.linalg.norm(loop))
     return 1.05 * float(gain.imag[np.abs(gain.real) <= 1e-6 * scale].max(initial=0.0))
 
 
 def continuous_crossings(plant: HeldPlant, assumed_s: float) -> tuple[FloatArray, FloatArray]:
-    """Frequencies (rad/s) and mismatches (s) of the roots of the continuous loop that are on the imaginary axis.
+    """Frequencies (rad/s) and mismatches (s) at which the continuous loop has a root on the imaginary axis.
 
     With M(s) = K e^{A tau^} (s I - A - B K)^{-1} B and an eigenvalue lambda of it, e^{s tau} is
-    lambda / (1 + lambda e^{-s tau^}). Of each crossing there are the nearest mismatches on either side. Where no
-    singular value of M exceeds a half, there is none.
+    lambda / (1 + lambda e^{-s tau^}). Each crossing yields the nearest mismatch on either side of zero. There is none
+    where no singular value of M exceeds a half.
     """
     highest = highest_crossing(plant, assumed_s)
     if highest <= 0.0:

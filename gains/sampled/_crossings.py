@@ -1,13 +1,13 @@
-"""The largest loop delay that one block of the sampled and held loop of `gains.sampled.constant` takes.
+"""The delay margin of one block of the sampled and held loop of `gains.sampled.constant`.
 
 With z = e^{j phi}, phi = omega T, an eigenvalue of the one-period map is on the unit circle at the delay
 tau = (q + m) T, q whole and 0 <= m < 1, exactly when z^{q+1} is an eigenvalue of the r x r loop
 
     H_m(z) = K (z I - Phi)^{-1} (G0(m) z + G1(m)).
 
-For each m there are finitely many angles phi, whatever q, at which an eigenvalue of H_m has modulus one. They change
-little within a period, so those at a few m lead to every crossing without a march through the delays. For one input
-they are eigenvalues of a Hamiltonian matrix and none is missed; for several, they come from a refined sweep.
+For each m there are finitely many angles phi, independent of q, at which an eigenvalue of H_m has modulus one. They
+change little within a period, so those at a few m lead to every crossing without a march through the delays. For one
+input they come from eigenvalues of a Hamiltonian matrix and none is missed; for several, from a refined sweep.
 """
 
 from functools import lru_cache
@@ -24,19 +24,19 @@ from gains.delay._crossings import separating_points
 from gains.delay._loci import delay_loci, sweep_frequencies, unit_crossings, unit_gain_roots, with_extrema
 from gains.sampled._loop import SampledPlant, block_radius, lifted_map, split_delay
 
-# least number of fractions m of a period at which the angles are computed; more when much happens in one period
+# least number of fractions m of a period at which the angles are computed; more if the loop is fast for its period
 _FRACTIONS = 8
 _REFINEMENTS = (1, 4, 16)
-# one-period maps larger than this are not checked by eigenvalues: each takes 20 ms and more
+# one-period maps larger than this are not checked by eigenvalues: each takes 20 ms or more
 _LARGEST_CHECK = 120
-# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 1e-12
+# fractions of the margin at which it is checked: the radius changes by about a part in 10^6, its error is 1e-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
 # a radius this near to one is no evidence: at a whole period it may pass one with no slope; at a multiple eigenvalue,
 # one within its rounding, up to this
 _AT_ONE, _MOST_ERROR = 1e-11, 1e-3
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
-# a residual this small beside its terms is rounding, and a delay this close to another (in periods) the same
+# a residual this small relative to its terms is rounding; delays this close together (in periods) are the same
 _ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 # where Newton's method ends without settling, a residual this small beside its terms is that of a multiple root
 _SOLVED = 1e-15
@@ -44,9 +44,9 @@ _SOLVED = 1e-15
 
 @lru_cache(maxsize=256)
 def block_delay_margin(plant: SampledPlant) -> float:
-    """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
+    """The least delay tau (s) at which the block loses stability; 0 if unstable without delay, `inf` if never.
 
-    It is computed once for each plant: designs, margins over links and loops of single vehicles all ask for it.
+    Cached for each plant: designs, margins over links and loops of single vehicles all need it.
 
     DisagreementError if the eigenvalues of the one-period map contradict the crossings found.
     """
@@ -55,7 +55,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
     if plant.B.shape[1] == 0:
         return inf
     contradiction = ""
-    # at periods near the limit of the loop, angles may appear and vanish between two fractions: refine then
+    # at periods near the loop's limit, angles may appear and vanish between two fractions, so refine
     for refinement in _REFINEMENTS:
         off_axis_s = _least_delay_off_the_real_axis(plant, refinement)
         margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
@@ -66,7 +66,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
 
 
 def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> float:
-    """The least tau >= 0 with an eigenvalue of the one-period map on the unit circle, +-1 excepted."""
+    """The least tau >= 0 with an eigenvalue of the one-period map on the unit circle other than +-1."""
     best_s = inf
     for delay_s, angle in sorted(_starts(plant, refinement)):
         if delay_s > best_s + 2.0 * plant.period_s:
@@ -80,8 +80,8 @@ def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> floa
 def _starts(plant: SampledPlant, refinement: int) -> list[tuple[float, float]]:
     """Delays (s) and angles near every possible first crossing.
 
-    At a fraction m a crossing of the angle phi and the locus e^{j theta} belongs to q = theta / phi - 1, which must be
-    whole: where it passes a whole number between two neighbouring m, there is a crossing.
+    At a fraction m, a crossing with angle phi and locus e^{j theta} has q = theta / phi - 1, which must be whole: a
+    crossing lies between two neighbouring m if q passes a whole number between them.
     """
     size = float(np.linalg.norm(plant.A) + np.linalg.norm(plant.B @ plant.K)) * plant.period_s
     count = refinement * int(np.clip(_FRACTIONS * size, _FRACTIONS, 4 * _FRACTIONS))
@@ -97,7 +97,7 @@ def _starts(plant: SampledPlant, refinement: int) -> list[tuple[float, float]]:
                     q, next_q = (theta + extra) / angle - 1.0, (theta + extra + turn) / next_angle - 1.0
                     starts += _between(plant, (q, next_q), (angle, next_angle), m, step)
         else:
-            # angles appear or vanish within this step: every one at either end is tried
+            # angles appear or vanish within this step: try every one at either end
             for end, list_of_end in ((m, found[i]), (m + step, found[i + 1])):
                 for angle, locus in list_of_end:
                     for extra in (0.0, 2.0 * pi):
@@ -109,9 +109,9 @@ def _starts(plant: SampledPlant, refinement: int) -> list[tuple[float, float]]:
 def _between(
     plant: SampledPlant, q: tuple[float, float], angle: tuple[float, float], m: float, step: float
 ) -> list[tuple[float, float]]:
-    """Linear interpolation of the delay and angle where q passes a whole number >= 0 between m and m + step."""
+    """Delay and angle where q passes a whole number >= 0 between m and m + step, by linear interpolation."""
     change = q[1] - q[0]
-    # a quarter of the step to either side for what is not linear
+    # a quarter of the step on either side allows for nonlinearity
     slack = 0.25 * abs(change) + 1e-9
     starts: list[tuple[float, float]] = []
     for whole in range(max(0, ceil(min(q) - slack)), floor(max(q) + slack) + 1):
@@ -123,8 +123,8 @@ def _between(
 def _unit_angles(plant: SampledPlant, m: float) -> list[tuple[float, complex]]:
     """Angles 0 < phi < pi at which H_m(e^{j phi}) has an eigenvalue of modulus one, each with this eigenvalue.
 
-    By Tustin's map z = (1 + w T/2) / (1 - w T/2) the unit circle becomes the imaginary axis w = j Omega,
-    phi = 2 atan(Omega T / 2), and H_m(z) = D + K (w I - F)^{-1} G, well scaled for any period.
+    Tustin's map z = (1 + w T/2) / (1 - w T/2) takes the unit circle to the imaginary axis w = j Omega, with
+    phi = 2 atan(Omega T / 2) and H_m(z) = D + K (w I - F)^{-1} G, well scaled for any period.
     """
     F, G, D = _tustin(plant, m)
     loci = delay_loci(F, G, plant.K, D)
@@ -159,10 +159,10 @@ def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, Floa
 
 
 def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
-    """The solution that `_newton` finds, or one at a whole number of periods, which it can miss.
+    """The delay (s) that `_newton` finds, or one at a whole number of periods, which it can miss.
 
-    The residual has a kink there, so a step may lead away from a solution: a start that is a solution is kept. A start
-    that nearly is one is tried again from both sides.
+    The residual has a kink there, so a step may lead away from a solution. A start that already is a solution is
+    therefore kept, and one that nearly is a solution is tried again from both sides.
     """
     beside_s = _SAME_PLACE * plant.period_s
     from_whole_s = abs(delay_s - round(delay_s / plant.period_s) * plant.period_s)
@@ -193,7 +193,7 @@ def _newton(plant: SampledPlant, delay_s: float, angle: float, *, multiple: bool
         if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * plant.period_s and delay_s > -plant.period_s):
             return np.nan
         step = abs(step_angle) / angle + abs(step_s) / plant.period_s
-        # rounding stops the steps from shrinking near 1e-13; larger steps that do not shrink lead nowhere
+        # near 1e-13, rounding stops the steps from shrinking; larger steps that do not shrink do not converge
         if step < 1e-14 or (step < 1e-9 and step >= 0.5 * previous):
             return delay_s
         previous = step
@@ -205,9 +205,9 @@ def _newton(plant: SampledPlant, delay_s: float, angle: float, *, multiple: bool
 def _residual(
     plant: SampledPlant, delay_s: float, angle: float
 ) -> tuple[float, tuple[NDArray[Any], ...], tuple[complex, complex]]:
-    """The least singular value of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the terms of M, and its derivatives.
+    """The least singular value u*M v of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the terms of M, and derivatives.
 
-    With its singular vectors u, v those of u*M v by phi and tau; dM / dtau = (z - 1) e^{A (T - e)} B K.
+    The derivatives are those of u*M v by phi and tau, u and v being singular; dM / dtau = (z - 1) e^{A (T - e)} B K.
     """
     period_s = plant.period_s
     whole, rest_s = split_delay(delay_s, period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
@@ -226,7 +226,7 @@ def _residual(
 def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
     """The least tau > 0 with an eigenvalue of the one-period map at z = -1.
 
-    There H_m is real, H_m(-1) = K (I + Phi)^-1 (G0 - G1), and must have the eigenvalue (-1)^{q+1}: one equation for m.
+    H_m is real there, H_m(-1) = K (I + Phi)^-1 (G0 - G1), and must have the eigenvalue (-1)^{q+1}: one equation for m.
     """
     fractions = np.linspace(0.0, 1.0, 8 * refinement * _FRACTIONS + 1)
     loops = _loops_at_minus_one(plant, fractions)
@@ -240,7 +240,7 @@ def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
             return np.linalg.det(identity - sign * _loops_at_minus_one(plant, m))
 
         values = determinant(fractions)
-        # rounding must not hide a root at a whole period from the intervals on both sides of it
+        # rounding must not hide a root at a whole period from the intervals on both its sides
         values[np.abs(values) < _ROUNDING] = 0.0
         at = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
         if at.size > 0:
@@ -256,7 +256,7 @@ def _loops_at_minus_one(plant: SampledPlant, m: FloatArray) -> FloatArray:
 
 
 def _contradiction(plant: SampledPlant, margin_s: float) -> str:
-    """What the spectral radius of the one-period map below and above the margin says against it; nothing if empty."""
+    """Message if the spectral radius of the one-period map below or above the margin contradicts it, else empty."""
     known_s = margin_s if margin_s < inf else 5.0 * plant.period_s
     if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:
         return ""

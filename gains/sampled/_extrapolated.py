@@ -1,12 +1,12 @@
-"""Vehicles that share a loop over links that differ: the station extrapolates the states of the slower links.
+"""Vehicles that share a loop over different links: the station extrapolates states that arrive over slower links.
 
-A command of vehicle i acts tau_i after its state was sampled. The states of others that it uses are brought to the
-instant of that sample. One that is older by delta_ij = max(0, a_j − a_i), where a is the age of a vehicle's newest
-state at the station, is extrapolated at constant velocity; a newer one is interpolated between reports. Hence
+A command of vehicle i acts tau_i after its state was sampled. The other vehicles' states that it uses are brought to
+the instant of that sample. If one is older by delta_ij = max(0, a_j − a_i), where a is the age of a vehicle's newest
+state at the station, it is extrapolated at constant velocity; a newer one is interpolated between reports. Hence
 
     u_i(t) = sum_j G_ij (p_j + delta_ij v_j, v_j)(t − tau_i − delta_ij)
 
-in positions p and velocities v of the vehicles. The ages are those that the station believes. An error of its estimate
+in positions p and velocities v of the vehicles. The ages are those estimated by the station. An error in its estimate
 of vehicle j's clock shifts j in time for the commands of all others, and back for j's own, which moves no root.
 """
 
@@ -20,14 +20,14 @@ from gains.delay.rightmost import rightmost_roots
 from gains.formation.model import FormationModel
 
 _AT_ZERO = 1e-6
-"""A root (1/s) nearer to zero than this is that of the formation's position, which nothing controls."""
+"""A root (1/s) this close to zero belongs to the formation's position, which is uncontrolled."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExtrapolatedLoop:
-    """x' = A x + B u, u = G x: positions and velocities of the vehicles of a block, then what else moves them.
+    """x' = A x + B u, u = G x, where x holds the positions of a block's vehicles, then their other states.
 
-    `positions` and `velocities` have the places of each vehicle's in x, (vehicles, axes), `inputs` those in u.
+    `positions` and `velocities` are the indices of each vehicle's entries in x, (vehicles, axes), `inputs` those in u.
     """
 
     A: FloatArray
@@ -38,12 +38,12 @@ class ExtrapolatedLoop:
     inputs: IntArray
 
     def growth_1_s(self, delays_s: Sequence[float], ages_s: Sequence[float]) -> float:
-        """Real part (1/s) of the rightmost root with these tau and a (s) of the vehicles."""
+        """Real part (1/s) of the rightmost root for the vehicles' delays tau and ages a (s)."""
         roots = rightmost_roots(self.terms(delays_s, ages_s), 1 + self.inputs.shape[1])
         return float(max(root.real for root in roots if abs(root) > _AT_ZERO))
 
     def terms(self, delays_s: Sequence[float], ages_s: Sequence[float]) -> list[tuple[FloatArray, float]]:
-        """Pairs (A, d) of x'(t) = sum A x(t - d) with these tau and a (s) of the vehicles."""
+        """Pairs (A, d) of x'(t) = sum A x(t - d) for the vehicles' delays tau and ages a (s)."""
         vehicles = len(self.inputs)
         terms: list[tuple[FloatArray, float]] = [(self.A, 0.0)]
         for i in range(vehicles):
@@ -64,14 +64,14 @@ class ExtrapolatedLoop:
 def extrapolated_loop(
     model: FormationModel, members: Sequence[int], A: FloatArray, B: FloatArray, K: FloatArray
 ) -> ExtrapolatedLoop:
-    """The loop e' = A e + B u, u = K e that members of a formation share, in positions instead of spacing errors.
+    """The loop e' = A e + B u, u = K e shared by members of a formation, with positions in place of spacing errors.
 
-    e has the errors of each member in turn, then the states of their responses.
+    e holds the errors of each member in turn, then the states of their responses.
     """
     step, at = np.arange(model.axes), 0
     spacing, velocities = dict[int, IntArray](), list[IntArray]()
     for i in members:
-        if i > 0:  # the leader's position is no error
+        if i > 0:  # the leader has no spacing error
             spacing[i] = at + step
             at += model.axes
         velocities.append(at + step)

@@ -1,4 +1,4 @@
-"""The sampled and held loop in matrices: one block, its hold integrals and its one-period map."""
+"""Matrices of the sampled and held loop: its blocks, hold integrals and one-period map."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, fields
@@ -12,15 +12,15 @@ from gains.core.arrays import BoolArray, ComplexArray, FloatArray
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import factor_rank
 
-# delays this close to a whole number of periods (in periods) count as it: (3 * 0.02) / 0.02 is not exactly 3
+# a delay this close to a whole number of periods (in periods) is rounded to it: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12
-# doublings of a stable map until nothing is added: motions that decay in 2^60 periods are as good as unstable
+# most doublings of a stable map until its sum converges: motions that take 2^60 periods to decay count as unstable
 _DOUBLINGS = 60
 _ROUNDING, _MOST = 1e-15, 1e30
 
 
 class ByContent:
-    """A dataclass of arrays and other values; two with the same bits are equal, and have the same results."""
+    """Mix-in for dataclasses of arrays and other values that makes two with the same bits equal, with equal hashes."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, type(self)) and self._content == other._content
@@ -55,7 +55,7 @@ class SampledPlant(Hashable, Protocol):
         ...
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """The same from each instant to the next, of a state whose first n entries are those on which K acts."""
+        """The same maps from each instant to the next, for a state whose first n entries are those K acts on."""
         ...
 
 
@@ -63,7 +63,7 @@ class SampledPlant(Hashable, Protocol):
 class HeldPlant(ByContent):
     """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period.
 
-    A station that predicts computes the states that are not `measured` (n,) from the commands; None: all are measured.
+    A predicting station computes states that are not `measured` (n,) from the commands; None if all are measured.
     """
 
     A: FloatArray
@@ -84,9 +84,9 @@ class HeldPlant(ByContent):
         return self.transition(np.diff(instants))
 
     def carry(self, duration_s: FloatArray) -> FloatArray:
-        """By how much a measured difference from the computed state grows over k durations: maps (k, n, n).
+        """Maps (k, n, n) that carry a difference between measured and computed state over k durations.
 
-        e^{A t} of the measured states; the others do not differ.
+        e^{A t} on the measured states; the others have no difference.
         """
         seen = np.arange(len(self.A)) if self.measured is None else np.flatnonzero(self.measured)
         maps = np.zeros((duration_s.size, *self.A.shape))
@@ -97,7 +97,7 @@ class HeldPlant(ByContent):
 def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatArray:
     """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
 
-    The powers of X are those of all durations: SciPy's `expm` takes 60 us for each matrix of a stack.
+    All durations share the powers of X: SciPy's `expm` takes 60 us for each matrix of a stack.
     """
     longest = float(durations.max(initial=0.0))
     norm = float(np.abs(generator).sum(axis=-1).max(initial=0.0)) * longest
@@ -116,7 +116,7 @@ def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatAr
 def held_blocks(
     A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, measured: NDArray[Any] | None = None
 ) -> list[HeldPlant]:
-    """The distinct strongly connected blocks of the loop, in balanced coordinates, with B K of each in full rank."""
+    """The distinct strongly connected blocks of the loop, balanced, with B K of each factored at full rank."""
     plants: list[HeldPlant] = []
     for block in distinct_blocks(A, B @ K, np.eye(len(A)) if measured is None else np.diag(measured)):
         A_block, BK_block = balanced(*block.matrices[:2])
@@ -136,7 +136,7 @@ def block_radius(plant: SampledPlant, delay_s: float) -> float:
 
 
 def settled_covariance(step: FloatArray, added: FloatArray) -> FloatArray | None:
-    """P = F P F' + Q of a map F and the noise Q of a period, by doubling; None if the map is not stable."""
+    """The steady-state covariance P = F P F' + Q of a map F with noise Q per period, by doubling; None if unstable."""
     covariance, power = added.copy(), step
     for _ in range(_DOUBLINGS):
         more = power @ covariance @ power.T
@@ -150,14 +150,14 @@ def settled_covariance(step: FloatArray, added: FloatArray) -> FloatArray | None
 
 
 def rate_of(radius: float, period_s: float) -> float:
-    """Exponential rate (1/s) of a motion that grows by a factor in every period: negative when it shrinks."""
+    """Exponential rate (1/s) of a motion that grows by the factor `radius` per period: negative when it decays."""
     return float(np.log(radius)) / period_s if radius > 0.0 else -inf
 
 
 def held_entry(plant: SampledPlant, z: ComplexArray, delay_s: float | FloatArray) -> ComplexArray:
-    """(G0 z + G1) z^{-q-1}, (k, n, r) at points z (k, 1, 1): what commands that are held and late do to the state.
+    """The effect of held, delayed commands on the state: (G0 z + G1) z^{-q-1}, (k, n, r), at points z (k, 1, 1).
 
-    The delay is that of all inputs, or of each (r,).
+    The delay is common to all inputs, or one for each (r,).
     """
     entry = np.zeros_like(plant.B) + 0j * z
     for own_s, of_own in _inputs_by_delay(delay_s, plant.B.shape[1]):
@@ -168,7 +168,7 @@ def held_entry(plant: SampledPlant, z: ComplexArray, delay_s: float | FloatArray
 
 
 def _inputs_by_delay(delay_s: float | FloatArray, inputs: int) -> list[tuple[float, FloatArray]]:
-    """Each delay there is, with ones (r,) at the inputs that have it."""
+    """Each distinct delay, with ones (r,) at the inputs that have it."""
     if isinstance(delay_s, np.ndarray):
         return [(own_s, np.equal(delay_s, own_s).astype(np.float64)) for own_s in np.unique(delay_s).tolist()]
     return [(delay_s, np.ones(inputs))]
@@ -185,9 +185,9 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
 
 
 def lifted_map(plant: SampledPlant, delay_s: float | FloatArray) -> FloatArray:
-    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, see `gains.sampled.constant.period_map`.
+    """The one-period map of (x_k, u_{k-1}, ..., u_{k-s}), see `gains.sampled.constant.period_map`.
 
-    The delay is that of all inputs, or of each (r,).
+    The delay is common to all inputs, or one for each (r,).
     """
     n, inputs = plant.B.shape
     splits = [(*split_delay(own_s, plant.period_s), of_own) for own_s, of_own in _inputs_by_delay(delay_s, inputs)]

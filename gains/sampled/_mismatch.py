@@ -1,13 +1,13 @@
-"""The mismatch window of one block of a predicted loop, at one rate or with telemetry at another rate than control.
+"""The mismatch window of one block of a predicted loop, with telemetry at the rate of control or at another rate.
 
-Its ends have det(I - N) = 0 on the unit circle, see `gains.sampled._predicted_difference`. Newton's method finds them.
-Its starting points come from loci: with a delay of q + m common periods, q whole and m below 1, N = z^{-q} S_m - S^.
-So z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus does not depend on q and only little on m. Where N is large,
-they are the crossings of the continuous loop, and delays within the window are looked at too. Loci can miss a short
-stretch of instability around a kink, a delay at which a command starts to act as a state is sampled: kinks are looked
-at where there are few. Each end is confirmed on either side by the spectrum of the map of one common period, or by
-Nyquist's criterion if that map is large. If another end lies nearer, bisection finds starting points closer to the
-assumed delay.
+At its ends det(I - N) = 0 on the unit circle, see `gains.sampled._predicted_difference`. Newton's method finds them.
+Its starting points come from loci: with a delay of q + m common periods, q whole and m below 1, N = z^{-q} S_m - S^, so
+z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus is independent of q and changes little with m. If N is large,
+the starting points are the crossings of the continuous loop, and delays inside the window are tested too. A kink is a
+delay at which a command starts to act as a state is sampled. Loci can miss a short interval of instability around one,
+so kinks are tested if they are few. Each end is confirmed on either side by the spectrum of the map of one common
+period, or by Nyquist's criterion if that map is large. If that finds an end nearer to the assumed delay, bisection
+provides starting points closer to it.
 """
 
 from collections.abc import Sequence
@@ -26,34 +26,33 @@ from gains.sampled._loop import HeldPlant, radius_of
 from gains.sampled._predicted_difference import PredictedDifference
 from gains.sampled.multirate import Timing
 
-# fractions of a period at which loci are computed, twice as many at two rates; the angle (rad) in a period below which
-# one is enough, and kinks do not matter; the largest N of which they are computed at two rates; and the delays in a
-# period at which det(I - N) is computed at z = -1 and 1
+# fractions of a period at which loci are computed, twice as many at two rates; angle (rad) per period below which one
+# fraction is enough and kinks do not matter; largest size of N whose loci are computed at two rates; delays per period
+# at which det(I - N) is computed at z = -1 and 1
 _FRACTIONS, _SLOW, _FEW, _AT_ONE = 4, 1.0, 4, 8
-# starting points to either side at most, and the assumed delay itself (control periods)
+# most starting points on either side; a mismatch below this (control periods) is no mismatch
 _TRIED, _AT_ASSUMED = 16, 1e-9
-# Newton's method: steps, the last one of a solution (control periods), and shares of angle and period for
-# derivatives
+# Newton's method: most steps; last step of a converged solution (control periods); increments for derivatives, as
+# shares of angle and period
 _STEPS, _SOLVED, _DIFFERENCE = 8, 1e-9, 1e-7
-# states of the largest map whose spectrum is computed, and how many kinks are looked at, times the control periods in a
-# common one
+# states of the largest map whose spectrum is computed; most kinks tested, times the control periods in a common one
 _LARGEST_CHECK, _KINKS = 40, 600
-# shares of the mismatch at which the loop must be stable, how far beside its end it is looked at, how much farther each
-# look beyond is than the one before, and up to how many mismatches and common periods
+# shares of the mismatch at the end at which the loop must be stable; relative offset of the tests beside the end;
+# ratio of successive mismatches tested beyond it, up to so many times the end's mismatch plus so many common periods
 _WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
 _SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
-# how many windows of other blocks the continuous crossings of a block must be away, for these few looks to be enough
+# if a block's continuous crossings are this many windows of the other blocks away, tests at these shares are enough
 _FAR, _WITHIN_FAR = 1.5, (0.5, 1.0)
-# halvings between two looks, after how many a solution is searched, from how many angles; and equal mismatches
+# most bisections; bisections between searches for a solution; angles per search; relative gap of equal mismatches
 _HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 3, 1e-9
 
 
 def common_window(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float) -> tuple[float, float]:
     """The nearest true (mean) loop delays (s) below and above the assumed one with an eigenvalue on the unit circle.
 
-    0 and `inf` if there is none, and `assumed_s` twice if the loop is unstable without mismatch. `plants`, the blocks
+    0 and `inf` if there are none, and `assumed_s` twice if the loop is unstable without mismatch. `plants`, the blocks
     of one loop, are held over the common period. The ends of a block are searched only if its continuous crossings are
-    not far outside the window of the others, or if it is not stable at all delays looked at within that.
+    not far outside the window of the other blocks, or if it is unstable at a delay tested inside that window.
     """
     for plant in plants:
         tick = plant.transition(np.array([timing.common_s / timing.ticks]))
@@ -70,7 +69,7 @@ def common_window(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float)
 
 
 class _Looks(NamedTuple):
-    """Mismatches (s) in one direction: where the loop is judged, the first that is likely beyond, all likely ends."""
+    """Mismatches (s) in one direction: those to test, the first one likely beyond the end, and all likely ends."""
 
     all_s: list[float]
     beyond_s: float
@@ -78,18 +77,18 @@ class _Looks(NamedTuple):
 
 
 class _Search:
-    """Looks for the ends of the window of one block."""
+    """Search for the ends of the window of one block."""
 
     def __init__(self, plant: HeldPlant, timing: Timing, assumed_s: float) -> None:
         self.plant, self.timing, self.assumed_s = plant, timing, assumed_s
         self.loop = PredictedDifference(plant, timing, assumed_s)
         self.tick_s, self.common_s = self.loop.tick_s, self.loop.common_s
-        # at many angles, eigenvalues of larger matrices would take most of the time; determinants take less
+        # at many angles, eigenvalues of larger matrices would take most of the time; determinants are cheaper
         self.by_loci = timing.ticks == 1 or len(self.loop.sample) <= _FEW
         self.stable = dict[float, bool]()
 
     def is_stable_within(self, shorter_s: float, longer_s: float) -> bool:
-        """Whether its ends are beyond these mismatches (s): far beyond by the continuous loop, and by a few looks."""
+        """Whether its ends are beyond these mismatches (s), by the crossings of the continuous loop and a few tests."""
         aside_s = continuous_crossings(self.plant, self.assumed_s)[1]
         near_s = _FAR * np.array([shorter_s, longer_s]) + self.timing.held_s
         if np.any((aside_s > -near_s[0]) & (aside_s < near_s[1])):
@@ -99,10 +98,10 @@ class _Search:
         return all(self.stable[look] for look in looks)
 
     def ends_s(self, shorter_s: float, longer_s: float) -> tuple[float, float]:
-        """How far (s) from the assumed delay the window ends below and above it, at most so far."""
+        """Mismatches (s) at which the window ends below and above the assumed delay, capped at the arguments."""
         aside_s = self._refined(*self._starts())
         below, above = self._looks(-1.0, shorter_s, aside_s), self._looks(1.0, longer_s, aside_s)
-        # in one go: at many small matrices, the number of calls takes the time
+        # in one call: with many small matrices, the number of calls dominates the time
         self._judge(
             [
                 self.assumed_s + way * aside_s
@@ -114,13 +113,13 @@ class _Search:
         return min(shorter_s, self._end_s(-1.0, below)), min(longer_s, self._end_s(1.0, above))
 
     def _looks(self, way: float, longest_s: float, aside_s: FloatArray) -> _Looks:
-        """Where the loop is judged below (-1) or above (1) the assumed delay, from the solutions found there."""
+        """Mismatches to test below (-1) or above (1) the assumed delay, from the solutions found on that side."""
         ends_s = way * aside_s
         ends_s = np.sort(ends_s[(ends_s > _AT_ASSUMED * self.tick_s) & (ends_s <= longest_s)])
         known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
         looks = [(1.0 - _BESIDE) * known_s, *self._kinks(way, max(known_s, float(ends_s.max(initial=0.0))))]
         beyond_s = inf
-        if not self.by_loci:  # these miss no crossing in between but those of a short stretch around a kink
+        if not self.by_loci:  # loci miss no crossing in between, except in a short interval around a kink
             looks += [share * known_s for share in _WITHIN]
         if ends_s.size or (not self.by_loci and way > 0.0):
             beyond_s = min(longest_s, (1.0 + _BESIDE) * known_s)
@@ -138,17 +137,17 @@ class _Search:
         return inf
 
     def _kinks(self, way: float, most_s: float) -> list[float]:
-        """Mismatches (s) up to this one at which a command starts to act as a state is sampled, the nearest of them."""
+        """The nearest mismatches (s) up to `most_s` at which a command starts to act as a state is sampled."""
         if highest_crossing(self.plant, self.assumed_s) * self.timing.held_s <= _SLOW:
             return []
         first_s = np.unique((way * (self.loop.samples_s + self.timing.spread_s - self.assumed_s)) % self.tick_s)
         aside_s = (first_s + np.arange(most_s / self.tick_s)[:, np.newaxis] * self.tick_s).ravel()
-        # the map takes as long as there are periods in it
+        # the time for a map grows with the periods in it
         near_s = aside_s[aside_s < most_s][: _KINKS // self.timing.ticks].tolist()
         return [own_s for own_s in near_s if not self._is_large(self.assumed_s + way * own_s)]
 
     def _between(self, way: float, stable_s: float, unstable_s: float, ends_s: FloatArray) -> float:
-        """The same, between two mismatches (s), with solutions of which some may be there."""
+        """The end between a stable and an unstable mismatch (s); `ends_s` are solutions, some of them perhaps there."""
         for halving in range(_HALVINGS):
             ends_s = ends_s[(ends_s >= stable_s) & (ends_s <= unstable_s)]
             if ends_s.size:
@@ -170,7 +169,7 @@ class _Search:
         )
 
     def _beside(self, delay_s: float) -> FloatArray:
-        """Mismatches (s) of the solutions next to a true delay, from the angles at which eigenvalues are near there."""
+        """Mismatches (s) of the solutions near a true delay, started from the angles of eigenvalues near the circle."""
         if not self._is_large(delay_s):
             values = np.linalg.eigvals(self.loop.maps(np.array([delay_s]))[0]).astype(np.complex128)
             angle = np.angle(values).astype(np.float64)
@@ -190,7 +189,7 @@ class _Search:
         return self.stable[delay_s]
 
     def _judge(self, delays_s: list[float]) -> None:
-        """Remember whether the loop is stable at each true delay: by its spectrum, or by Nyquist's criterion."""
+        """Record whether the loop is stable at each true delay, by its spectrum or by Nyquist's criterion."""
         large = [delay_s for delay_s in delays_s if self._is_large(delay_s)]
         small = [delay_s for delay_s in delays_s if not self._is_large(delay_s)]
         if large:
@@ -203,13 +202,13 @@ class _Search:
         return self.loop.states(delay_s) > _LARGEST_CHECK
 
     def _starts(self) -> tuple[FloatArray, FloatArray]:
-        """Angles and mismatches (s) near the ends, the nearest to either side."""
+        """Angles and mismatches (s) near the ends, the nearest on either side."""
         if self.by_loci:
             angle, aside_s = self._by_loci()
         else:
             frequency, aside_s = continuous_crossings(self.plant, self.assumed_s + self.tick_s / 2.0)
             angle = np.abs((frequency * self.common_s + pi) % (2.0 * pi) - pi)
-        # z = -1, and at two rates z = 1 too, where det(I - N) is real
+        # also z = -1 and z = 1, where det(I - N) is real
         spans_s = (self.common_s, self.common_s), (self.timing.held_s, self.tick_s)
         beside_s = np.unique(np.concatenate([np.arange(-2.0 * a, 2.0 * a, b / _AT_ONE) for a, b in spans_s]))
         answers = self.loop.answers(np.maximum(0.0, self.assumed_s + beside_s))
@@ -223,7 +222,7 @@ class _Search:
         return angle[chosen], aside_s[chosen]
 
     def _by_loci(self) -> tuple[FloatArray, FloatArray]:
-        """The same of all crossings, from loci."""
+        """Angles and mismatches (s) near all crossings, from loci."""
         grid = self.loop.at(self.loop.grid.angle[1:])
         fractions = min(self.timing.ticks, 2) * (_FRACTIONS if grid.angle[-1] > _SLOW else 1)
         m = np.arange(fractions) / fractions
@@ -244,17 +243,17 @@ class _Search:
         return np.tile(angle, 2), np.concatenate([longer_s % turn_s, longer_s % turn_s - turn_s])
 
     def _refined(self, angle: FloatArray, aside_s: FloatArray) -> FloatArray:
-        """Mismatches (s) of the solutions next to these starting points, of those that lead to one."""
+        """Mismatches (s) of the solutions to which Newton's method converges from these starting points."""
         if angle.size == 0:
             return aside_s
         delay_s, beside_s = self.assumed_s + aside_s, _DIFFERENCE * self.tick_s
-        # 1 / (u'(I - N)^{-1} v) is zero where det(I - N) is; for the singular vectors u and v that is the least value
+        # 1 / (u'(I - N)^{-1} v) is zero where det(I - N) is; for the singular vectors it is the least singular value
         vectors = np.linalg.svd(self.loop.differences(self.loop.at(angle), self.loop.answers(delay_s)))
         left, right = vectors.Vh[:, -1], vectors.U[:, :, -1:]
         solved_s = [np.zeros(0)]
         for _ in range(_STEPS):
             answers = self.loop.answers(np.concatenate([delay_s, delay_s + beside_s]))
-            # at the place itself, at an angle beside it, and at a delay beside it
+            # at the point itself, with the angle incremented, and with the delay incremented
             here, turn = np.arange(angle.size), _DIFFERENCE * np.where(angle > 0.0, angle, 1.0)
             answers = answers.of(np.concatenate([here, here, here + angle.size]))
             solved = solved_beside_poles(
@@ -278,6 +277,6 @@ class _Search:
 
 
 def _ranked(maps: NDArray[np.complexfloating]) -> ComplexArray:
-    """Eigenvalues (k, m) of maps (k, m, m), the largest first."""
+    """Eigenvalues (k, m) of maps (k, m, m), largest first."""
     loci = np.linalg.eigvals(maps).astype(np.complex128)
     return np.take_along_axis(loci, np.argsort(-np.abs(loci), axis=1), 1)

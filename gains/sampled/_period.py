@@ -1,7 +1,7 @@
 """All sampling periods at which the sampled and held loop is stable without further delay.
 
-A loop may be stable again at periods beyond its first limit, or need a long period in the first place (an oscillator
-pushed at the right instants), so the march through the periods goes on past the first limit.
+A loop may become stable again at periods beyond its first limit, or be stable only at long periods (an oscillator
+pushed at the right instants), so the march through the periods continues past the first limit.
 """
 
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gains.sampled._loop import HeldPlant, held_blocks
 from gains.sampled.constant import checked_loop
 
-# windows are listed up to this many times the first limit; without a limit, of ten time constants
+# windows are listed up to this many times the first limit or, if there is none, ten time constants
 _HORIZON = 20.0
-# periods in one step of the march, and in all: a march through very many oscillations of the plant stops there
+# periods in one step of the march, and in total: a march through very many oscillations of the plant stops there
 _CHUNK, _MOST_PERIODS = 256, 40_000
 # ratio of neighbouring periods, and their largest distance in periods of the plant's fastest oscillation
 _RATIO, _STEP = 1.03, 0.02
-# e^{A T} is zero to rounding where its slowest motion has decayed by e^-40, and hides the rest where one has grown by
-# e^30
+# e^{A T} is zero to rounding once its slowest motion has decayed by e^-40; a motion that has grown by e^30 hides the
+# others
 _DECAYED, _GROWN = 40.0, 30.0
 # a motion of the plant that is this slow beside its norm is an integrator, or so far away that e^{A T} is rounding
 _STILL = 1e-12
@@ -34,10 +34,10 @@ _TOUCH = 1e-7
 
 @dataclass(frozen=True)
 class PeriodCrossing:
-    """At the period `period_s` eigenvalues e^{+-j omega T} of the one-period map are on the unit circle.
+    """A period `period_s` at which eigenvalues e^{+-j omega T} of the one-period map are on the unit circle.
 
     `direction` is +1 when they leave the unit circle as the period grows, -1 when they enter it, 0 when they touch it
-    and return, as at a period in which an undamped plant turns once and no sample sees it move.
+    and return, as where an undamped plant oscillates once per period and no sample sees it move.
     """
 
     omega_rad_s: float
@@ -47,9 +47,9 @@ class PeriodCrossing:
 
 @dataclass(frozen=True)
 class PeriodAnalysis:
-    """Open windows of stable periods, complete up to `complete_to_s`, and where they begin and end.
+    """Open windows of stable periods, complete up to `complete_to_s`, and the crossings that bound them.
 
-    `limit_s` is the end of the window that begins at 0, or 0 when none does. `unstable_roots_at_zero_period` counts
+    `limit_s` is the end of the window that begins at 0, or 0 if none does. `unstable_roots_at_zero_period` counts
     eigenvalues of A + B K with positive real part.
     """
 
@@ -61,10 +61,10 @@ class PeriodAnalysis:
 
 
 def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
-    """Windows of the period of the loop x' = A x + B u, u = K x sampled and held.
+    """Stable sampling periods of the loop x' = A x + B u, u = K x sampled and held.
 
-    Listed up to twenty times the first limit at least. Found by a march through the periods: a search, not a proof.
-    Arguments and exceptions as of `gains.sampled.constant.sampled_delay_margin`.
+    Windows are listed up to twenty times the first limit: farther for a stable plant, less far if an unstable motion
+    hides the others. Found by a march: a search, not a proof. BadModelError names a matrix that does not fit.
     """
     plant, entry, feedback = checked_loop(A, B, K)
     loop_roots = np.linalg.eigvals(plant + entry @ feedback).astype(np.complex128)
@@ -77,7 +77,7 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
         crossings += [crossing for found, _ in steps for crossing in found]
         reached_s = min(reached_s, steps[-1][1])
     crossings = sorted((c for c in crossings if c.period_s < reached_s), key=lambda crossing: crossing.period_s)
-    # once e^{A T} has died out nothing depends on the period any more
+    # once e^{A T} has decayed to zero, nothing depends on the period any more
     end_s = inf if forgets and reached_s == wanted_s else reached_s
     edges_s = [0.0, *(crossing.period_s for crossing in crossings), end_s]
     windows = tuple(window for window in pairwise(edges_s) if _is_stable(blocks, window, reached_s))
@@ -91,14 +91,14 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
 
 
 def _first_limit(block: HeldPlant) -> float:
-    """The least period (s) at which the block loses stability; 0 if none is short enough, `inf` if none is found."""
+    """The least period (s) at which the block loses stability; 0 if A + B K is not Hurwitz, `inf` if none is found."""
     if float(np.linalg.eigvals(block.A + block.B @ block.K).real.max()) >= 0.0:
         return 0.0
     return next((found[0].period_s for found, _ in _marched(block, _last_period(block.A)[0]) if found), inf)
 
 
 def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool]:
-    """How far (s) to look, and whether e^{A T} has died out there."""
+    """Longest period (s) to search, and whether e^{A T} has decayed to zero there."""
     rate = float(np.linalg.norm(A) + np.linalg.norm(BK))
     horizon_s = _HORIZON * (limit_s if 0.0 < limit_s < inf else 10.0 / rate if rate > 0.0 else 1.0)
     last_s, decays = _last_period(A)
@@ -106,7 +106,7 @@ def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool
 
 
 def _last_period(A: FloatArray) -> tuple[float, bool]:
-    """The period (s) beyond which nothing new is seen, and whether all motions of the plant have died out there."""
+    """The period (s) beyond which nothing new appears, and whether all motions of the plant have decayed there."""
     slowest = float(np.linalg.eigvals(A).real.max())
     if abs(slowest) <= _STILL * float(np.linalg.norm(A)):
         return inf, False
@@ -120,13 +120,13 @@ def _is_stable(blocks: list[HeldPlant], window: tuple[float, float], last_s: flo
 
 
 def _eigenvalues(block: HeldPlant, periods_s: FloatArray) -> ComplexArray:
-    """Those of the one-period map at each period (k,), shape (k, n)."""
+    """Eigenvalues of the one-period map at each period (k,), shape (k, n)."""
     states, hold = block.transition(periods_s)
     return np.linalg.eigvals(states + hold @ block.K).astype(np.complex128)
 
 
 def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCrossing], float]]:
-    """Crossings of one block's spectral radius through one, step by step, and how far (s) the march has come."""
+    """For each step of the march: crossings of one block's spectral radius through one, and the period (s) reached."""
 
     def log_radius(periods_s: FloatArray) -> FloatArray:
         return np.log(np.maximum(np.abs(_eigenvalues(block, periods_s)).max(axis=1), 1e-300))
@@ -142,7 +142,7 @@ def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCr
         periods_s = _next_periods(start_s, horizon_s, block.A)
         looked_at, start_s = looked_at + periods_s.size, float(periods_s[-1])
         periods_s, logs = _with_peaks(log_radius, periods_s, log_radius(periods_s))
-        # dips into stability between two looks
+        # dips into stability between two periods
         periods_s, negative = _with_peaks(lambda at_s: -log_radius(at_s), periods_s, -logs)
         touches_s, off = periods_s[negative == 0.0], negative != 0.0
         periods_s, logs = periods_s[off], -negative[off]
@@ -157,7 +157,7 @@ def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCr
 
 
 def _next_periods(start_s: float, end_s: float, A: FloatArray) -> FloatArray:
-    """Ascending periods of one step of the march: geometric until they would skip an oscillation of the plant."""
+    """Ascending periods for one step of the march: geometric until they would skip an oscillation of the plant."""
     fastest = float(np.abs(np.linalg.eigvals(A).imag).max())
     largest_step_s = 2.0 * np.pi * _STEP / fastest if fastest > 0.0 else inf
     periods_s = [start_s]
@@ -167,9 +167,9 @@ def _next_periods(start_s: float, end_s: float, A: FloatArray) -> FloatArray:
 
 
 def _with_peaks(log_radius: Functions, periods_s: FloatArray, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The samples, with those local maxima below zero located and added that may reach it.
+    """The samples, with the local maxima below zero that may reach it located and added.
 
-    A maximum as near to zero as can be told has the value zero: the radius touches one.
+    A maximum that cannot be distinguished from zero is set to zero: the radius touches one.
     """
     at = np.flatnonzero(may_reach_zero(periods_s, logs[:, np.newaxis]))
     if at.size == 0:

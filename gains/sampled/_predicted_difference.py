@@ -1,16 +1,16 @@
-"""I - N of one block of a predicted loop, at one rate or with telemetry at another rate than control.
+"""I - N of one block of a predicted loop, with telemetry at the rate of control or at another rate.
 
-Let X_i be the predicted state at the instant at which command i is assumed to act: X_{i+1} = Phi X_i + G u_i. At the
+Let X_i be the predicted state at the instant at which command i is assumed to act: X_{i+1} = Phi X_i + G u_i. At
 sample j the measured state differs from the predicted one by w_j, and a command k computed from it is
 
     u_k = K X_k + K L_k w_j,   L_k = `HeldPlant.carry` from that sample to the instant at which the command acts.
 
-Both states answer to the same commands, one after the true delay and one after the assumed delay, so each is that of X
-an instant earlier: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r by the true delay, minus the same by the assumed one.
-Of w_j only v_j matters: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u
-depends on v by a transfer function that is stable if the loop without delay is stable, and v depends on u. Together
-v = N(z) v, with N = 0 where there is no mismatch. So where an eigenvalue is on the unit circle, det(I - N) = 0 there,
-and the loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
+Both states respond to the same commands, one after the true delay and one after the assumed delay, so each is X at an
+earlier instant: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r from the true delay, minus the same from the assumed one.
+Only v_j matters: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u depends
+on v through a transfer function that is stable if the loop without delay is stable, and v depends on u. Together
+v = N(z) v, with N = 0 if there is no mismatch. An eigenvalue is on the unit circle where det(I - N) = 0, and the loop
+is stable exactly if det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
 """
 
 from functools import cached_property
@@ -23,20 +23,20 @@ from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Timing
 
-# rad by which a delayed term turns between neighbouring angles, the longest true delay (in assumed ones) for which it
-# does, and the least number of angles
+# rotation (rad) of a delayed term between neighbouring angles; longest true delay (in assumed delays) that the grid
+# resolves; least number of angles
 _TURN, _LONGEST, _ANGLES = 0.25, 1.5, 200
-# angles added to even ones: shares of the highest
+# angles added to an even grid, as shares of the highest
 _LOW = np.logspace(-5.0, 0.0, 80)
-# no angle is needed where the norm of N stays below this
+# the grid ends at the angle beyond which the norm of N stays below this
 _SMALL = 0.95
-# largest relative change of det(I - N) between neighbouring angles, into how many parts they are divided for that, how
-# often, and the modulus of a zero
+# largest relative change of det(I - N) between neighbouring angles; parts into which an interval is divided to meet it;
+# most such refinements; the modulus that replaces zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
 
 
 class Grid(NamedTuple):
-    """Angles (k,) of z, X_0 (k, n, m) as a function of v, and what the samples see of it by the assumed delay."""
+    """Angles (k,) of z, X_0 (k, n, m) as a function of v, and the part of it that samples see at the assumed delay."""
 
     angle: FloatArray
     first: ComplexArray
@@ -44,18 +44,18 @@ class Grid(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """What the samples see of X_0 and v: exponents of z (k, m), maps (k, m, n) and (k, m, m)."""
+    """Responses of the samples to X_0 and v: exponents of z (k, m), maps (k, m, n) and (k, m, m)."""
 
     exponents: FloatArray
     of_first: FloatArray
     of_v: FloatArray
 
     def of(self, delays: IntArray) -> "Answers":
-        """Those to some of the true delays."""
+        """The responses at the true delays with these indices."""
         return Answers(*(part[delays] for part in self))
 
     def each(self) -> list["Answers"]:
-        """Those to each true delay alone."""
+        """The responses at each true delay, one at a time."""
         return [self.of(np.array([k])) for k in range(len(self.of_v))]
 
 
@@ -75,7 +75,7 @@ class PredictedDifference:
         late_s = np.array([computed_s for _, computed_s in commands]) + max(0.0, assumed_s - self.spread_s) - taken_s
         seen = np.eye(n) if plant.measured is None else np.diag(plant.measured.astype(np.float64))[plant.measured]
         carried = K @ plant.carry(late_s) @ seen.T
-        # rows of v: what they see of w, and of which sample; and what v adds to each command
+        # rows of v: their maps from w and their samples; and the contribution of v to each command
         counted, onto = list[FloatArray](), list[FloatArray]()
         for sample in range(self.samples_s.size):
             every = np.vstack(list(carried[of_sample == sample]))
@@ -97,7 +97,7 @@ class PredictedDifference:
 
     @cached_property
     def grid(self) -> Grid:
-        """Angles from 0 to pi, or to where the norm of N stays below one at every true delay."""
+        """Angles from 0 to pi, or to the angle beyond which the norm of N stays below one at every true delay."""
         coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), pi * _LOW)
         delays_s = self.spread_s + np.linspace(0.0, self.common_s, max(self.ticks, 8) + 1)
         _, onto_first, onto_v = self.answers(delays_s)
@@ -112,12 +112,12 @@ class PredictedDifference:
         return np.linalg.solve(free, self.added[-1]).astype(np.complex128)
 
     def at(self, angle: FloatArray) -> Grid:
-        """What does not depend on the true delay, at k angles."""
+        """The quantities that do not depend on the true delay, at k angles."""
         grid = Grid(angle, self._first(angle), np.zeros(1, np.complex128))
         return grid._replace(assumed=self.seen_at(grid, self.by_assumed))
 
     def answers(self, delays_s: FloatArray) -> Answers:
-        """What the samples see with k true delays."""
+        """The responses of the samples at k true delays."""
         until_s = self.samples_s - np.maximum(0.0, delays_s - self.spread_s)[:, np.newaxis]
         behind = np.floor(until_s / self.tick_s + 1e-11)
         rest_s = np.maximum(0.0, until_s - behind * self.tick_s)
@@ -130,7 +130,7 @@ class PredictedDifference:
         return Answers(periods.astype(np.float64), of_first[:, :, 0], of_v[:, :, 0])
 
     def seen_at(self, grid: Grid, answers: Answers) -> ComplexArray:
-        """What the samples see of v through the commands, (k, m, m), with one true delay or k of them."""
+        """Response of the samples to v through the commands, (k, m, m), for one true delay or k of them."""
         # real and imaginary parts side by side: a product of a real and a complex matrix takes twice as long
         seen = (answers.of_first @ grid.first.view(np.float64)).view(np.complex128)
         seen += answers.of_v
@@ -138,34 +138,34 @@ class PredictedDifference:
         return seen
 
     def differences(self, grid: Grid, answers: Answers) -> ComplexArray:
-        """I - N (k, m, m), with one true delay or k of them."""
+        """I - N (k, m, m), for one true delay or k of them."""
         return np.eye(len(self.sample)) + grid.assumed - self.seen_at(grid, answers)
 
     def determinants(self, grid: Grid, answers: Answers) -> ComplexArray:
-        """det(I - N) (k,), none of them zero."""
+        """det(I - N) (k,), with zeros replaced by a tiny number."""
         values = np.linalg.det(self.differences(grid, answers)).astype(np.complex128)
         return np.where(values == 0.0, _LEAST, values)
 
     def states(self, delay_s: float) -> int:
-        """How many states `maps` have at a true delay."""
+        """The number of states of `maps` at a true delay."""
         late_s = max(delay_s, self.assumed_s) - self.spread_s
         return len(self.closed) + len(self.sample) * max(1, ceil(late_s / self.common_s - 1e-11))
 
     def maps(self, delays_s: FloatArray) -> FloatArray:
-        """The loop's map of one common period at k true delays, (k, states, states).
+        """The loop's map over one common period at k true delays, (k, states, states).
 
-        Its state is X_0 of P periods ago and the v since then, the oldest first; nothing acts later than that.
+        Its state is X_0 of P periods ago and the v since then, oldest first; nothing takes longer than that to act.
         """
         answers, (n, m) = self.answers(delays_s), self.added[-1].shape
         late = [-part.exponents.astype(np.int64) for part in (answers, self.by_assumed)]
         periods = max(1, *(int(own.max()) for own in late))
-        # X_0 of each later period as a function of that state
+        # X_0 of each later period as a function of the state
         first = np.zeros((periods + 1, n, n + periods * m))
         first[0, :, :n] = np.eye(n)
         for k in range(periods):
             first[k + 1] = self.powers[-1] @ first[k]
             first[k + 1, :, n + k * m : n + (k + 1) * m] += self.added[-1]
-        # of v in the state, and of v itself: what is seen by the true delay minus the same by the assumed one
+        # responses to the state and to the new v: at the true delay, minus those at the assumed delay
         seen = np.zeros((delays_s.size, m, n + (periods + 1) * m))
         at = np.arange(delays_s.size)[:, np.newaxis, np.newaxis], np.arange(m)[:, np.newaxis]
         for own, part, sign in zip(late, (answers, self.by_assumed), (1.0, -1.0), strict=True):
@@ -179,7 +179,7 @@ class PredictedDifference:
         return maps
 
     def turns(self, delays_s: list[float]) -> list[int]:
-        """How often det(I - N) goes around 0 as z goes around the unit circle, backwards, at each true delay."""
+        """How often det(I - N) encircles 0, clockwise, as z goes around the unit circle, at each true delay."""
         turned = [np.angle(values[1:] / values[:-1]).sum() for _, values in self.resolved(np.array(delays_s))]
         last = self.grid.angle[-1:].repeat(len(delays_s))
         if last[0] < pi:  # from there to pi the eigenvalues of I - N stay in the right half plane
@@ -188,7 +188,7 @@ class PredictedDifference:
         return [-round(float(turn) / pi) for turn in turned]
 
     def resolved(self, delays_s: FloatArray) -> list[tuple[FloatArray, ComplexArray]]:
-        """For each true delay, angles and det(I - N), which changes little from each angle to the next."""
+        """For each true delay, angles and det(I - N), refined until it changes little from each angle to the next."""
         answers = self.answers(delays_s)
         found = [(self.grid.angle, self.determinants(self.grid, own)) for own in answers.each()]
         changing = list(range(delays_s.size))
@@ -207,10 +207,10 @@ class PredictedDifference:
 
 
 def _refining(angle: FloatArray, values: ComplexArray) -> FloatArray:
-    """Angles between neighbours at which values change too much."""
+    """Angles to insert between neighbours whose values differ too much."""
     size, width = np.abs(values), np.diff(angle)
     slope = np.abs(np.diff(values)) / (np.minimum(size[1:], size[:-1]) * width)
-    # slopes beside them count too: two zeros at one place turn the phase by a whole turn, which looks like none
+    # neighbouring slopes count too: two zeros at one place change the phase by a whole turn, which looks like no change
     steepest = np.maximum(slope, np.maximum(np.append(slope[1:], 0.0), np.append(0.0, slope[:-1])))
     coarse = np.flatnonzero(width * steepest > _MOST_TURN)
     shares = np.arange(1.0, _PARTS) / _PARTS

@@ -1,14 +1,14 @@
-"""The loop that is flown: sampled, late and held.
+"""The loop as flown: sampled, delayed and held.
 
 The plant x' = A x + B u is sampled at t_k = k T. The command u_k = K x(t_k) acts from t_k + tau until the next one
-replaces it at t_k + tau + T (zero-order hold). tau >= 0 is the whole loop delay: uplink, waiting, computing and
+replaces it at t_k + tau + T (zero-order hold). tau >= 0 is the whole loop delay: uplink, waiting, computation and
 downlink. With tau = q T + e, 0 <= e < T, the state at the next sample is
 
     x_{k+1} = Phi x_k + G0 u_{k-q} + G1 u_{k-q-1},
     Phi = e^{A T},  G0 = int_0^{T-e} e^{A s} ds B,  G1 = int_{T-e}^{T} e^{A s} ds B,
 
 the modified z-transform in state space. The loop is stable exactly if the spectral radius of this one-period map is
-below one. For small T the margin in tau is the continuous one less T / 2, up to terms in T^2.
+below one. For small T the margin in tau is that of the continuous loop minus T / 2, up to terms in T^2.
 """
 
 from numpy.typing import ArrayLike
@@ -21,17 +21,17 @@ from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
 
 
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:
-    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, size n + s p for p inputs.
+    """The one-period map of (x_k, u_{k-1}, ..., u_{k-s}), a matrix of size n + s p for p inputs.
 
-    s is q for a delay of exactly q periods, else q + 1. A (n, n), B (n, p) and K (p, n) are real, with the feedback u =
-    +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an argument that is not.
+    s is q for a delay of exactly q periods, else q + 1. A (n, n), B (n, p) and K (p, n) are real, with the feedback
+    u = +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an invalid argument.
     """
     plant = HeldPlant(*checked_loop(A, B, K), positive_seconds("period_s", period_s))
     return lifted_map(plant, seconds("delay_s", delay_s))
 
 
 def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
-    """Factor by which the slowest motion shrinks (< 1) or grows (> 1) in one period. Arguments as of `period_map`.
+    """Factor by which the slowest motion decays (< 1) or grows (> 1) in one period. Arguments as for `period_map`.
 
     Strongly connected blocks are taken one by one, so that equal followers do not spoil each other's eigenvalues.
     """
@@ -42,10 +42,10 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
 def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
     """Exponential rate (1/s) of the slowest motion, ln(spectral radius) / T: negative when stable.
 
-    For a loop at rest after finitely many periods (deadbeat) it is -inf or, by rounding, very negative. Arguments as of
-    `period_map`.
+    For a loop that comes to rest in finitely many periods (deadbeat) it is -inf or, with rounding, very negative.
+    Arguments as for `period_map`.
 
-    x' = u, u = -x without delay: x_{k+1} = (1 - T) x_k.
+    For x' = u, u = -x without delay, x_{k+1} = (1 - T) x_k:
 
     >>> round(growth_rate([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
     -1.386294
@@ -56,12 +56,12 @@ def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, de
 def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float) -> float:
     """The least delay tau (s) at which the sampled and held loop loses stability.
 
-    0 if it is unstable at tau = 0, `inf` if it is stable at every delay. Accurate to about 1e-12 relative, 1e-6 if the
-    radius leaves one without a slope. A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; `period_s`
-    is the period T of telemetry and control. BadModelError names an argument that does not fit; DisagreementError if
-    the spectral radius of the one-period map below or above the margin contradicts it.
+    0 if it is unstable at tau = 0, `inf` if it is stable at every delay. The relative accuracy is about 1e-12, or 1e-6
+    if the spectral radius passes one with zero slope. A (n, n), B (n, p) and K (p, n) are real, with the feedback
+    u = +K x; `period_s` is the period T of telemetry and control. BadModelError names an invalid argument;
+    DisagreementError if the spectral radius of the one-period map below or above the margin contradicts it.
 
-    x' = u, u = -x with a period of 1 s takes a delay of 1 s; with a short one pi / 2 - T / 2 or so:
+    x' = u, u = -x has a margin of 1 s at a period of 1 s, and of about pi / 2 - T / 2 at a short period T:
 
     >>> [round(sampled_delay_margin([[0]], [[1]], [[-1]], period_s=period_s), 3) for period_s in (1.0, 0.02)]
     [1.0, 1.561]
@@ -71,7 +71,7 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
 
 
 def forget_margins() -> None:
-    """Forget the sampled margins computed so far, so that a measured time includes their computation.
+    """Clear the cache of sampled margins, so that a timing includes their computation.
 
     >>> forget_margins()
     """
@@ -79,7 +79,7 @@ def forget_margins() -> None:
 
 
 def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A (n, n), B (n, p), K (p, n) as finite real matrices; BadModelError names what does not fit."""
+    """A (n, n), B (n, p), K (p, n) as finite real matrices; BadModelError names one that does not fit."""
     [plant] = square_matrices(A=A)
     entry, feedback = real_matrix("B", B), real_matrix("K", K)
     if entry.shape[0] != plant.shape[0]:

@@ -1,7 +1,7 @@
-"""Vehicles that act on each other, block by block: the margin of each block and its growth at any loop delay.
+"""Blocks of vehicles that act on each other: the margin of each block and its growth at any loop delay.
 
-The states of a formation fall into blocks that do not act on the blocks ahead of them: in a leader-follower tree every
-vehicle is a block of its own. The formation is stable exactly when every block is, each at its own loop delay.
+The states of a formation form blocks that do not act on the blocks ahead of them: in a leader-follower tree every
+vehicle is a block of its own. The formation is stable exactly if every block is, each at its own loop delay.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -25,17 +25,17 @@ from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop, stre
 from gains.sampled.prediction import checked_mask, mismatch_window, mismatch_window_continuous, predicted_growth_rate
 
 _SHIFT_1_S = 1e-6
-"""Roots count as unstable right of this: those at zero of the formation's position, which nothing controls, do not."""
+"""Roots right of this are unstable; the root at zero of the formation's position, which is uncontrolled, is not."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoupledBlock:
-    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
+    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; all have the same axes.
 
-    `system_ids` names the vehicles. `onboard` is the loop that they close on board, None where a station closes every
-    loop: all feedback is then late. `assumed_s` is the loop delay over which the station predicts, None without
-    prediction, and `measured` as in `gains.sampled.prediction`. `extrapolated` is the same loop with a state of each
-    age, for vehicles that share a loop which the station closes without prediction.
+    `system_ids` names the vehicles. `onboard` is the loop closed on board, None if the station closes every loop: all
+    feedback is then late. `assumed_s` is the loop delay over which the station predicts, None without prediction, and
+    `measured` is as in `gains.sampled.prediction`. `extrapolated` is the same loop with states of different ages, for
+    vehicles that share a loop that the station closes without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -50,15 +50,15 @@ class CoupledBlock:
 
     @property
     def has_late_terms(self) -> bool:
-        """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
+        """Whether any feedback inside the block is late; a single vehicle in the onboard loop has none."""
         return bool(self._continuous_terms()[1].any())
 
     def margin_s(self) -> float:
-        """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""
+        """The loop delay (s) at which the sampled and held loop loses stability: the upper end of its window."""
         return self.window_s()[1]
 
     def window_s(self) -> tuple[float, float]:
-        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
+        """The loop delays (s) between which the sampled and held loop is stable; starts at 0 without prediction."""
         if self.onboard is not None:
             return 0.0, self.onboard.sampled_margin_s()
         loop = self.A, self.B, self.K, self.timing
@@ -67,7 +67,7 @@ class CoupledBlock:
         return mismatch_window(*loop, assumed_s=self.assumed_s, measured=self.measured)
 
     def window_continuous_s(self) -> tuple[float, float]:
-        """The same of the continuous model; the hold counts as half a period."""
+        """The same window for the continuous model; the hold counts as half a period."""
         half_s = self.timing.held_s / 2.0
         if self.onboard is not None:
             return 0.0, self.onboard.continuous_margin_s() - half_s
@@ -93,10 +93,10 @@ class CoupledBlock:
     def growth_continuous_at_1_s(
         self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None
     ) -> float:
-        """The same where each vehicle's command has a loop delay of its own.
+        """`growth_continuous_1_s` with a separate loop delay for each vehicle's command.
 
-        `age_s` has the ages of the states when the station uses them. Without them all states that a command uses are
-        taken as of one instant.
+        `age_s` holds the age of each vehicle's state when the station uses it. Without it, all states that a command
+        uses are taken to be sampled at one instant.
         """
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
         if age_s is not None and self.extrapolated is not None:
@@ -104,10 +104,10 @@ class CoupledBlock:
         return rightmost_root(self._terms(delays_s)).real
 
     def is_stable_at(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> bool:
-        """Whether the sampled loop is stable where each vehicle has a loop delay of its own.
+        """Whether the sampled loop is stable if each vehicle has its own loop delay.
 
-        The continuous model tells, in which the hold counts as the delay with which equal links have the margin of the
-        sampled loop. `age_s` as of `growth_continuous_at_1_s`. A thousand times as fast as the growth over long links.
+        Decided by the continuous model, with the hold counted as the delay that gives equal links the margin of the
+        sampled loop. A thousand times as fast as the growth over long links. `age_s` as for `growth_continuous_at_1_s`.
         """
         delays_s = [loop_delay_s[system_id] + self._hold_s for system_id in self.system_ids]
         if age_s is not None and self.extrapolated is not None:
@@ -118,7 +118,7 @@ class CoupledBlock:
         shifted.append((-_SHIFT_1_S * np.eye(len(terms[0][0])), 0.0))
         try:
             return count_unstable_roots(shifted) == 0
-        except DisagreementError:  # at the edge
+        except DisagreementError:  # on the stability boundary
             return False
 
     @cached_property
@@ -129,7 +129,7 @@ class CoupledBlock:
         return self.timing.held_s / 2.0 + shorter_s
 
     def _continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        """Of the continuous model: what acts after delays that are known (s), and what acts a loop delay late."""
+        """The continuous model: pairs (matrix, known delay in s), and the matrix that acts a loop delay late."""
         if self.onboard is not None:
             return self.onboard.continuous_terms()
         if self.assumed_s is None:
@@ -149,10 +149,10 @@ class CoupledBlock:
         return [*known, *zip(own, delays_s, strict=True)]
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None) -> float:
-        """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.
+        """Growth rate (1/s) of the sampled loop if each vehicle has its own loop delay.
 
-        Exact if delays and ages are equal. Otherwise it is the rate at the mean delay, plus what the differences add in
-        the continuous model. `age_s` as of `growth_continuous_at_1_s`.
+        Exact if delays and ages are equal. Otherwise the rate at the mean delay, plus the change that the differences
+        make in the continuous model. `age_s` as for `growth_continuous_at_1_s`.
         """
         delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
         ages_s = {(age_s or {}).get(system_id) for system_id in self.system_ids}
@@ -165,7 +165,7 @@ class CoupledBlock:
 
     @property
     def kind(self) -> Hashable:
-        """Equal for blocks that are the same system, made of other vehicles."""
+        """Key that is equal for blocks of different vehicles that are the same system."""
         return self.timing, self.assumed_s, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
 
 
@@ -182,12 +182,12 @@ def coupled_blocks(
 ) -> list[CoupledBlock]:
     """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
 
-    `system_ids` has one for each vehicle, in the order of `model`. Without `onboard`, the timing of the onboard loop,
-    the station closes every loop. It predicts over `assumed_s` if that is given. `responding` is A, B and K of the
-    formation with the vehicles' responses, and `response_states` which of its states are those of each vehicle's
-    (`gains.performance.response`); without them the vehicles respond at once.
+    `system_ids` holds one ID per vehicle, in the order of `model`. `onboard` is the timing of the onboard loop; without
+    it, the station closes every loop. It predicts over `assumed_s` if that is given. `responding` is A, B and K of the
+    formation with the vehicles' responses, and `response_states` are the slices of its states that belong to each
+    vehicle's response (`gains.performance.response`); without them the vehicles respond at once.
 
-    A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
+    In a chain of three, each vehicle is a block and the two followers are alike. Sampling at 50 Hz costs half a period:
 
     >>> chain = FormationModel((-1, 0, 1))
     >>> K = chain.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
@@ -226,9 +226,9 @@ def unlike_blocks(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
 def critical_block(
     blocks: Sequence[CoupledBlock], loop_delay_s: Mapping[int, float], age_s: Mapping[int, float] | None = None
 ) -> CoupledBlock:
-    """The block whose predicted growth (1/s) at the loop delays (s) of its vehicles is largest; the first in a tie.
+    """The block with the largest predicted growth (1/s) at the loop delays (s) of its vehicles; the first in a tie.
 
-    `age_s` as of `CoupledBlock.growth_at_1_s`.
+    `age_s` as for `CoupledBlock.growth_at_1_s`.
     """
     known: dict[Hashable, float] = {}
     ages_s = age_s or {}

@@ -1,16 +1,16 @@
-"""Telemetry at one rate, control at another: when samples are used, and the margin of the loop that results.
+"""Loops with telemetry and control at different rates: when samples are used, and the margin that results.
 
 The vehicle samples its state every `telemetry_s`; the station computes a command every `control_s` from the newest
-sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats what is
-already held, and a sample that a newer one overtakes is never used. In a common period T of both, n commands act, where
-n is the number of slower periods in T:
+sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats the
+command already held, and a sample overtaken by a newer one is never used. In a common period T of both, n commands
+act, where n is the number of slower periods in T:
 
-* If the slower period is a whole multiple of the faster one, n = 1. Every command is late by the same time, and the
-  loop is that of `gains.sampled.constant` with the slower period.
-* Otherwise the commands are late by the least loop delay plus 0, g, 2 g, ..., (n - 1) g, in an order that the rates
-  fix; g is the faster period divided by n. Phases only rotate this order, so the least loop delay determines the loop,
-  and so does the mean over the commands that are the first from their sample, (n - 1) g / 2 longer. *Loop delay* here
-  is that mean: it changes less from rate to rate.
+* If the slower period is a whole multiple of the faster one, n = 1. All commands have the same delay, and the loop is
+  that of `gains.sampled.constant` with the slower period.
+* Otherwise the commands have the least loop delay plus 0, g, 2 g, ..., (n - 1) g, in an order fixed by the rates; g is
+  the faster period divided by n. Phases only rotate this order, so the least loop delay determines the loop. So does
+  the mean over the commands that are the first to use their sample, which is (n - 1) g / 2 longer. *Loop delay* here is
+  that mean, because it changes less from rate to rate.
 """
 
 from bisect import bisect_right
@@ -31,19 +31,19 @@ from gains.delay.constant import delay_margin
 from gains.sampled._loop import HeldPlant, SampledPlant, block_radius, held_blocks, radius_of, rate_of
 from gains.sampled.constant import checked_loop, sampled_delay_margin
 
-# instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
+# instants closer together than this (in common periods) coincide: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
-# Most slower periods in a common period. Rates without such a common period are replaced by the nearest that have one:
-# over so many periods the phase of the real ones creeps by less than a clock drifts within seconds.
+# Limit on slower periods in a common period. Rates without such a common period are replaced by the nearest that have
+# one: over so many periods their phase drifts by less than a clock drifts within seconds.
 _MOST_COMMANDS = 20
-# delays looked at in one slower period, in which no visible motion turns by more than half a circle, and in one
-# continuous margin; the longer step is taken
+# delays evaluated per slower period, in which no visible motion turns by more than half a circle, and per continuous
+# margin; the longer step of the two is taken
 _LOOKS, _LOOKS_MARGIN = 6, 40
-# the margin is searched up to this many continuous margins, and slower periods more
+# the margin is searched up to this many continuous margins plus this many slower periods
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
-# Longer margins, in slower periods, are computed as if there were one rate: by measurement right to two parts in 10^4.
+# longer margins, in slower periods, are computed as if at one rate: measured to be right to two parts in 10^4
 _MOST_PERIODS = 30.0
-# the radius at a margin is this far below one at most
+# the spectral radius at a margin is at most this far below one
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
 _NEAR_ONE = 0.99
@@ -57,11 +57,11 @@ _DENSE = 0.4
 
 @dataclass(frozen=True)
 class Timing:
-    """Periods (s) of control and telemetry, and what follows from them.
+    """Periods (s) of control and telemetry, and the quantities derived from them.
 
     BadModelError if a period is not positive and finite.
 
-    Control at 50 Hz, telemetry at 20 Hz: samples at 0 and 50 ms are first used at 0 and 60 ms.
+    With control at 50 Hz and telemetry at 20 Hz, samples at 0 and 50 ms are first used at 0 and 60 ms:
 
     >>> timing = Timing(control_s=0.02, telemetry_s=0.05)
     >>> timing.held_s, timing.commands, timing.common_s, timing.spread_s
@@ -77,7 +77,7 @@ class Timing:
 
     @property
     def held_s(self) -> float:
-        """The slower period: how long a command from a new sample is held, in the mean."""
+        """The slower period: the mean time for which a command from a new sample is held."""
         return max(self.control_s, self.telemetry_s)
 
     @property
@@ -92,17 +92,17 @@ class Timing:
 
     @property
     def faster_s(self) -> float:
-        """The faster period, as a part of T."""
+        """The faster period, as a fraction of T."""
         return self.common_s / self._ratio.numerator
 
     @property
     def step_s(self) -> float:
-        """g: the loop delays of commands differ by multiples of it; the faster period if n = 1."""
+        """g, of which differences between the commands' loop delays are multiples; the faster period if n = 1."""
         return self.faster_s / self.commands
 
     @property
     def spread_s(self) -> float:
-        """How much longer the mean loop delay of a common period is than the least one."""
+        """Mean loop delay over a common period minus the least one."""
         return (self.faster_s - self.step_s) / 2.0
 
     @cached_property
@@ -116,10 +116,10 @@ class Timing:
         return self._ratio.numerator if self.telemetry_s > self.control_s else self.commands
 
     def commands_from(self, first: int, last: int, *, every_tick: bool = False) -> list[tuple[float, float]]:
-        """(Instant of its sample, instant at which it is computed) of the commands first to last, without any delay.
+        """(Sample instant, computation instant) of the commands first to last, without delay.
 
-        Command 0 is computed from a sample that arrives just then, at 0. With `every_tick` commands that repeat a
-        sample count too.
+        Command 0 is computed at 0 from a sample that arrives at that instant. With `every_tick`, commands that reuse a
+        sample are included.
         """
         slower_s, faster_s = self.held_s, self.faster_s
         near = _SAME_INSTANT * self.commands
@@ -135,21 +135,21 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
     """Exponential rate (1/s) of the slowest motion at a (mean) loop delay: negative when stable.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; BadModelError names one that does not fit. A
-    `delay_s` (s) below the least that these rates can have counts as that.
+    `delay_s` (s) below the least mean possible at these rates is raised to it.
     """
     return lifted_growth(held_blocks(*checked_loop(A, B, K), period_s=timing.common_s), timing, delay_s=delay_s)
 
 
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
-    """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
+    """The least (mean) loop delay (s) at which the loop loses stability; 0 if unstable at once, `inf` if none is found.
 
-    If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact. If it
-    is longer than thirty slower periods, it is that of the slower period alone. Otherwise the least loop delay is
-    raised in steps, smaller ones where the loop comes near instability, up to three times the margin of the continuous
-    loop plus ten slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
+    If the slower period is a multiple of the faster one, the margin is the exact one of `gains.sampled.constant`. If
+    the continuous margin exceeds thirty slower periods, the margin is that of the slower period alone. Otherwise the
+    loop delay is raised in steps, smaller ones where the loop comes near instability, up to three times the margin of
+    the continuous loop plus ten slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
     `gains.sampled.constant.sampled_delay_margin`.
 
-    x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
+    x' = u, u = -x has a margin of 1 s if either of the two periods is 1 s and the other divides it:
 
     >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
     [1.0, 1.0]
@@ -165,14 +165,14 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """The plant that is believed, and the (mean) loop delay (s) over which it is predicted."""
+    """The station's model of the plant, and the (mean) loop delay (s) over which it predicts."""
 
     believed: HeldPlant
     assumed_s: float
 
     @property
     def computed(self) -> list[int]:
-        """The states that are computed from the commands alone, for want of a measurement."""
+        """Indices of the states that are not measured and are computed from the commands alone."""
         measured = self.believed.measured
         return [] if measured is None else np.flatnonzero(~measured).tolist()
 
@@ -180,10 +180,10 @@ class Predictor:
 def multirate_map(
     plant: SampledPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None
 ) -> FloatArray:
-    """The matrix that takes (x, u(command -1), u(command -2), ...) one common period on.
+    """The map of (x, u(command -1), u(command -2), ...) over one common period.
 
-    u = K x(sample), or with a predictor, at every control tick, K times the state predicted for when it acts. States
-    that it computes because they are not measured follow the commands.
+    u = K x(sample). With a predictor, u at every control tick is K times the state predicted for the instant at which
+    it acts. The states that the predictor computes, because they are not measured, follow the commands.
     """
     inputs, on = plant.K.shape
     common_s, count = timing.common_s, timing.commands if predictor is None else timing.ticks
@@ -194,7 +194,7 @@ def multirate_map(
     schedule = timing.commands_from(-earlier, count - 1, every_tick=predictor is not None)
     close_s, taken_s = _SAME_INSTANT * common_s, [sampled_s for sampled_s, _ in schedule[earlier:]]
     acts_s, assumed_s = ([computed_s + late_s for _, computed_s in schedule] for late_s in (least_s, least_assumed_s))
-    # commands before the period that still act in it, truly or by the assumption
+    # commands from before the period that still act in it, by the true or the assumed delay
     kept = max(0, *(earlier + 1 - bisect_right(s, close_s) for s in (acts_s, *([assumed_s] if predictor else []))))
     inside = [at_s for at_s in acts_s if close_s < at_s < common_s - close_s]
     instants = _merged([0.0, *inside, *taken_s, common_s], close_s)
@@ -209,7 +209,7 @@ def multirate_map(
     acting = [bisect_right(assumed_s, at_s + close_s) - 1 - earlier for at_s in times]
 
     def carried(state: FloatArray, from_s: float, to_s: float) -> FloatArray:
-        """What the station believes of the state at one instant of `times`, from that at another."""
+        """The station's estimate of the state at one instant of `times`, propagated from another."""
         for k in range(*(bisect_right(times, at_s + close_s) - 1 for at_s in (from_s, to_s))):
             Phi, hold = maps[k]
             state = Phi @ state + hold @ commands[acting[k]]
@@ -240,7 +240,7 @@ def lifted_radius(plant: SampledPlant, timing: Timing, *, delay_s: float, predic
 
 
 def lifted_growth(plants: Sequence[SampledPlant], timing: Timing, *, delay_s: float) -> float:
-    """`multirate_growth_rate` (1/s) at a mean loop delay (s), from the plants of the blocks in a common period."""
+    """`multirate_growth_rate` (1/s) at a mean loop delay (s), from the blocks' plants over a common period."""
     if timing.commands == 1:
         radius = max(block_radius(plant, seconds("delay_s", delay_s)) for plant in plants)
     else:
@@ -249,19 +249,19 @@ def lifted_growth(plants: Sequence[SampledPlant], timing: Timing, *, delay_s: fl
 
 
 def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
-    """Whether a margin near this is so long that only the means count: of the loop delay, and of the time of a hold."""
+    """Whether a margin near `near_s` is so long that only the mean loop delay and the mean hold time matter."""
     return _MOST_PERIODS * timing.held_s < near_s < inf
 
 
 def lifted_margin(plants: Sequence[SampledPlant], timing: Timing, *, near_s: float) -> float:
-    """`multirate_delay_margin` from the blocks likewise; `near_s` is the margin of the continuous loop."""
+    """`multirate_delay_margin` from the blocks' plants; `near_s` is the margin of the continuous loop."""
     known_s = near_s if isfinite(near_s) else 0.0
     last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
     step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
     looks = (timing.spread_s + np.arange(0.0, last_s, step_s)).tolist()
     least_s = inf
     for plant in plants:
-        # without feedback one look tells; beyond the margin of another plant none does
+        # without feedback one delay is enough; delays beyond another plant's margin do not matter
         seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
         found_s = first_unstable(
             lambda delay_s, plant=plant: lifted_radius(plant, timing, delay_s=delay_s), seen, timing
@@ -271,7 +271,7 @@ def lifted_margin(plants: Sequence[SampledPlant], timing: Timing, *, near_s: flo
 
 
 def _merged(instants: list[float], close_s: float) -> list[float]:
-    """Ascending instants, those within rounding of each other once."""
+    """The instants in ascending order, those within rounding of each other merged."""
     merged: list[float] = []
     for instant in sorted(instants):
         if not merged or instant - merged[-1] > close_s:
@@ -322,15 +322,14 @@ def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) 
 
 
 def effective_delay_s(commands: IntArray, *, held_s: float) -> float:
-    """The constant loop delay (s) equivalent to commands: the mean age of the state behind them, less T / 2.
+    """Effective delay: the constant loop delay (s) equivalent to a series of commands, from their mean age less T / 2.
 
-    `commands` (k, 2) has the instants in ns at which each acted and at which the state behind it was sampled, in order.
-    T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
-    newer state acts, T / 2 on average when all arrive. Unlike the median of the loop delays, this accounts for commands
-    that never arrived. Where delays change fast compared with the loop's motion, only the mean age matters, to first
-    order.
+    `commands` (k, 2) holds the instants in ns at which each command acted and at which its state was sampled, in order.
+    T = `held_s` is the slower of the periods of telemetry and control. The acting command ages until one from a newer
+    state acts, T / 2 on average if all arrive. Unlike the median of the loop delays, this accounts for lost commands.
+    If delays change fast compared with the loop's motion, only the mean age matters, to first order.
 
-    Every 20 ms a command from a state of 0.1 s before acts; then one command is lost:
+    Every 20 ms a command acts whose state was sampled 0.1 s before; then one command is lost:
 
     >>> acted_ns = np.array([0, 20, 40, 60, 100]) * 1_000_000
     >>> commands = np.column_stack([acted_ns, acted_ns - 100_000_000])

@@ -1,6 +1,6 @@
-"""The onboard loop as it is flown: each vehicle feeds back its own errors, a station those of others, late.
+"""The onboard loop as flown: each vehicle feeds back its own errors; the station feeds back those of others, late.
 
-Every vehicle uses its own errors at once and those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
+Every vehicle uses its own errors without delay and those of others with the delay tau (Sahoo 2012, eqs. 5.1, 5.2)::
 
     x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
 
@@ -10,11 +10,11 @@ if telemetry has another rate, as in `gains.sampled.multirate`:
 * The vehicle computes its own part of the command `steps` times in T and holds it. It knows its velocity error at that
   instant. A sensor measures its spacing error at every `steps_per_sample`-th step; in between, the spacing is
   extrapolated with the relative velocity of the last measurement.
-* The station computes its part from states that all vehicles sample at one instant t_k = k T, at the first of their
-  steps. It acts from t_k + tau on and is held for T.
+* The station computes its part from states that all vehicles sample at the same instant t_k = k T, at the first of
+  their steps. This part acts from t_k + tau on and is held for T.
 
 Over T the local loop is thus a linear map of the state alone, and the late part enters it as a held command enters a
-plant (`_crossings`). Clocks that differ by less than a step change the margin only to second order in the step.
+plant (`_crossings`). Clock offsets below a step change the margin only to second order in the step.
 """
 
 from collections.abc import Sequence
@@ -46,9 +46,9 @@ class OnboardTiming:
     control_s: float
     """Period (s) of the station's commands."""
     steps: int = 1
-    """Steps of the vehicle's own loop in a control period."""
+    """Steps of the vehicle's own loop per control period."""
     steps_per_sample: int = 1
-    """The sensor measures once in this many steps; a divisor of `steps`."""
+    """Steps per sensor measurement; a divisor of `steps`."""
     telemetry_s: float | None = None
     """Period (s) of telemetry; `control_s` if None."""
 
@@ -62,12 +62,12 @@ class OnboardTiming:
 
     @property
     def rates(self) -> Timing:
-        """When states are used."""
+        """The rates of control and telemetry."""
         return Timing(self.control_s, self.control_s if self.telemetry_s is None else self.telemetry_s)
 
     @property
     def common(self) -> "OnboardTiming":
-        """The same loop with the common period of control and telemetry as the period of both."""
+        """The same loop with both periods set to the common period of control and telemetry."""
         common_s = self.rates.common_s
         times = round(common_s / self.control_s)
         return OnboardTiming(common_s, self.steps * times, self.steps_per_sample)
@@ -75,9 +75,9 @@ class OnboardTiming:
 
 @dataclass(frozen=True, eq=False)
 class OnboardLoop:
-    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when each part acts.
+    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and the timing of each part.
 
-    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others.
+    `sensed` is B K_own for the spacing errors, `known` is B K_own for the velocity errors, `late` is B K_others.
     """
 
     A: FloatArray
@@ -87,7 +87,7 @@ class OnboardLoop:
     timing: OnboardTiming
 
     def part(self, states: IntArray) -> "OnboardLoop":
-        """The loop of some of the states: those of vehicles that act on each other."""
+        """The loop of a subset of the states: those of vehicles that act on each other."""
         at = np.ix_(states, states)
         return OnboardLoop(self.A[at], self.sensed[at], self.known[at], self.late[at], self.timing)
 
@@ -96,15 +96,15 @@ class OnboardLoop:
         return delay_margin(self.A + self.sensed + self.known, self.late)
 
     def sampled_margin_s(self) -> float:
-        """The least delay tau at which the loop as flown loses stability; 0 if at once, `inf` if never.
+        """The least delay tau at which the loop as flown loses stability; 0 if unstable without delay, `inf` if never.
 
-        DisagreementError as of `gains.sampled.constant.sampled_delay_margin`.
+        DisagreementError as for `gains.sampled.constant.sampled_delay_margin`.
         """
         plants, rates = self.plants(), self.timing.rates
         if rates.commands == 1:
             return min(block_delay_margin(plant) for plant in plants)
         continuous_s = self.continuous_margin_s()
-        if hardly_sampled(rates, near_s=continuous_s):  # a command held for T stands for a delay of T / 2
+        if hardly_sampled(rates, near_s=continuous_s):  # holding a command for T counts as a delay of T / 2
             one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
             return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
         return lifted_margin(plants, rates, near_s=continuous_s)
@@ -114,7 +114,7 @@ class OnboardLoop:
         return lifted_growth(self.plants(), self.timing.rates, delay_s=delay_s)
 
     def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
-        """What acts after delays that are known (s), and what acts tau late."""
+        """Pairs (matrix, known delay in s), and the matrix that acts tau late."""
         own_s = self.timing.control_s / self.timing.steps / 2.0  # a hold counts as half a step
         return [(self.A, 0.0), (self.sensed + self.known, own_s)], self.late
 
@@ -128,8 +128,8 @@ class OnboardLoop:
 class LocalPlant(ByContent):
     """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part B K is its input.
 
-    A = `free` + `sensed` + `known` is what the sampled local loop approximates. Between steps the state x is followed
-    by the last sensor measurement of it, and by what the vehicle itself adds to x'.
+    The sampled local loop approximates A = `free` + `sensed` + `known`. Between steps the state x is augmented by its
+    last sensor measurement and by the contribution of the vehicle's own command to x'.
     """
 
     free: FloatArray
@@ -152,11 +152,11 @@ class LocalPlant(ByContent):
         return self.period_s / self.timing.steps
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As of the protocol; both maps include the responses of the steps in between."""
+        """As in the protocol; both maps include the steps of the local loop in between."""
         begin, n = (self.period_s - duration_s) / self._step_s, len(self.free)
         following = np.ceil(begin - _SAME_INSTANT).astype(np.int64)
         rest_s = np.maximum(following - begin, 0.0) * self._step_s
-        # from the state alone: what the sensor saw at an earlier step does not depend on it
+        # response to the state alone: earlier sensor measurements do not depend on it
         whole = self._ends[following] @ matrix_exponentials(self._generator, rest_s)
         return whole[:, :n, :n], whole[:, :n, 3 * n :]
 
@@ -174,7 +174,7 @@ class LocalPlant(ByContent):
 
     @cached_property
     def _ends(self) -> FloatArray:
-        """Maps to the period's end, of the state and the held input: from just before each step, and from the end."""
+        """Maps of the state and the held input to the period's end, from just before each step and from the end."""
         [flow] = matrix_exponentials(self._generator, np.array([self._step_s]))
         maps = [np.eye(len(flow))]
         for number in reversed(range(self.timing.steps)):
@@ -183,14 +183,14 @@ class LocalPlant(ByContent):
 
     @cached_property
     def _generator(self) -> FloatArray:
-        """Of the flow between two steps."""
+        """Generator of the continuous motion between two steps."""
         n, inputs = self.B.shape
         generator = np.zeros((3 * n + inputs, 3 * n + inputs))
         generator[:n, :n], generator[:n, 2 * n : 3 * n], generator[:n, 3 * n :] = self.free, np.eye(n), self.B
         return generator
 
     def _step(self, number: int) -> FloatArray:
-        """The map of the state and the held input over one step of the vehicle's loop."""
+        """The jump of the state and the held input at one step of the vehicle's loop."""
         n, age_steps = len(self.free), number % self.timing.steps_per_sample
         look, compute = np.eye(len(self._generator)), np.eye(len(self._generator))
         if age_steps == 0:
@@ -201,7 +201,7 @@ class LocalPlant(ByContent):
 
 
 def local_plant(parts: Sequence[FloatArray], timing: OnboardTiming) -> LocalPlant:
-    """The plant of A, `sensed`, `known` and `late` (n, n) of an `OnboardLoop`, its input of full rank."""
+    """The plant of A, `sensed`, `known` and `late` (n, n) of an `OnboardLoop`, with an input of full rank."""
     free, sensed, known, late = parts
     return LocalPlant(free, sensed, known, *factor_rank(late), timing)
 
@@ -209,9 +209,9 @@ def local_plant(parts: Sequence[FloatArray], timing: OnboardTiming) -> LocalPlan
 def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) -> OnboardLoop:
     """The onboard loop of a formation with the gain K (inputs, states) of u = K e.
 
-    The own part K_own are its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
+    K_own consists of its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
 
-    A follower uses its own errors at once, and its leader needs nobody: no delay destabilises the pair.
+    The follower uses its own errors without delay and the leader uses no others, so no delay destabilises the pair:
 
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
@@ -231,11 +231,11 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 def streamed_loop(
     model: FormationModel, K: FloatArray, timing: OnboardTiming
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A, B and K_others of x' = A x + B w, w = K_others x: what is left to a station that predicts.
+    """A, B and K_others of x' = A x + B w, w = K_others x: the part left to a predicting station.
 
-    The vehicles' own loops are part of A: of all flows, it is the one that has the states of the sampled loops whenever
-    the sensors measure. BadModelError if there is none, because the steps are too long for the gains. With it margins
-    differ from those of `OnboardLoop` by 2 parts in 10^4 at 17 1/s and 50 Hz.
+    A includes the vehicles' own loops: it is the continuous system whose states equal those of the sampled loops at
+    every sensor measurement. BadModelError if none exists, because the steps are too long for the gains. Margins
+    computed with it differ from those of `OnboardLoop` by 2 parts in 10^4 at 17 1/s and 50 Hz.
 
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> A, _, others = streamed_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
@@ -261,7 +261,7 @@ def streamed_loop(
 
 
 def own_part(model: FormationModel, K: FloatArray) -> FloatArray:
-    """K (inputs, states) with its blocks (i, i) only, by which vehicle i uses its own errors.
+    """K (inputs, states) reduced to its blocks (i, i), by which vehicle i uses its own errors.
 
     >>> own_part(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]

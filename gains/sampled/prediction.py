@@ -1,23 +1,23 @@
-"""Delay-compensated control: which true delays a loop takes whose station predicts over an assumed one.
+"""Delay compensation by prediction over an assumed loop delay, and the true delays that the loop tolerates.
 
-The station knows each command it has sent. It carries the newest sample on, under the commands that act after it, to
-the instant at which the new command acts if the loop delay is tau^, and feeds the predicted state back:
+The station knows each command it has sent. It propagates the newest sample, under the commands that act after it, to
+the instant at which the new command acts if the loop delay is tau^, and feeds back the predicted state:
 
     x^(t_k + tau^) = Phi(tau^) x_k + sum_j Gamma_j u_{k-j},   u_k = K x^(t_k + tau^),
     Phi(t) = e^{A t},   Gamma_j = int Phi(tau^ - s) B ds over [tau^ - j T, tau^ - (j - 1) T] within [0, tau^]
 
-If tau^ is the true loop delay tau, the loop behind the delay is that without delay. What limits it is the mismatch
+If tau^ equals the true loop delay tau, the loop behind the delay is the loop without delay. Its limit is the mismatch
 tau - tau^: the *mismatch window* is the interval of true delays around tau^ in which it is stable. Every control tick
-predicts, so a command counts even if its sample has been used before. Loop delays are those of `multirate`.
+predicts, so a command counts even if its sample has been used before. Loop delays are defined as in `multirate`.
 
 In continuous time u(t) = K (e^{A tau^} x(t) + int_0^tau^ e^{A s} B u(t - s) ds) gives x'(t) = A x(t) + B u(t - tau)
 the roots of
 
     det(s I - A - B K - B K e^{A tau^} (e^{-s tau} - e^{-s tau^})) = 0,
 
-a loop with two delays, one of them known. An acceleration is not in a vehicle's telemetry: the station computes it from
-its commands alone, and e^{A tau^} then carries on only what is `measured`, see `HeldPlant.carry`. Robustness and string
-stability are in `gains.criteria.predicted`. Source:
+a loop with two delays, one of them known. A vehicle's telemetry does not contain its acceleration: the station computes
+it from the commands alone, and e^{A tau^} then acts only on `measured` states, see `HeldPlant.carry`. Robustness and
+string stability are in `gains.criteria.predicted`. Source:
 Z. Artstein, "Linear systems with delayed controls: a reduction", IEEE Trans. AC 27 (1982).
 """
 
@@ -48,19 +48,18 @@ def mismatch_window(
 ) -> tuple[float, float]:
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
-    0 if it is stable down to no delay, `inf` if no longer delay is found to be too long, and `assumed_s` twice if it is
-    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s. Each is confirmed on
-    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large.
-    Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
+    The first is 0 if the loop is stable down to zero delay, the second `inf` if no upper limit is found; both are
+    `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s,
+    each confirmed on either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map
+    is large. Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
-    see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay over which is predicted.
-    `measured` says which states are sampled, all if None; the station computes the others from its commands alone, K
-    must not use them, and they must not depend on those that are sampled.
-    BadModelError names an argument that does not fit; DisagreementError is raised if a window ends where no
-    eigenvalue is found on the unit circle.
+    see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay of the prediction.
+    `measured` flags the states that are sampled, all if None; the station computes the others from its commands alone.
+    K must not use those, and they must not depend on sampled states. BadModelError names an argument that does not fit;
+    DisagreementError is raised if a window ends where no eigenvalue is found on the unit circle.
 
-    x' = u, u = -x takes 1.56 s at 50 Hz. A station that assumes 3 s takes 1.45 to 4.77 s:
+    x' = u, u = -x has a margin of 1.56 s at 50 Hz. With a station that assumes 3 s it is stable from 1.45 to 4.77 s:
 
     >>> [round(end_s, 3) for end_s in mismatch_window([[0]], [[1]], [[-1]], Timing(0.02, 0.02), assumed_s=3.0)]
     [1.449, 4.765]
@@ -73,11 +72,12 @@ def mismatch_window(
 def mismatch_window_continuous(
     A: ArrayLike, B: ArrayLike, K: ArrayLike, *, assumed_s: float, measured: Sequence[bool] | None = None
 ) -> tuple[float, float]:
-    """The same of the continuous loop. A hold counts as half a period of both delays.
+    """The mismatch window of the continuous loop. A hold counts as half a period in both delays.
 
-    The frequencies come from a sweep of loci: a search, not a proof. Exceptions as of `mismatch_window`.
+    The frequencies come from a sweep of loci: a search, not a proof. Arguments as for `mismatch_window`, BadModelError
+    names one that does not fit.
 
-    x' = u, u = -x: s + 1 + e^{-s tau} - e^{-3 s} = 0.
+    For x' = u, u = -x the characteristic equation is s + 1 + e^{-s tau} - e^{-3 s} = 0:
 
     >>> [round(end_s, 3) for end_s in mismatch_window_continuous([[0]], [[1]], [[-1]], assumed_s=3.0)]
     [1.386, 4.873]
@@ -103,9 +103,9 @@ def predicted_growth_rate(
 ) -> float:
     """Exponential rate (1/s) of the slowest motion at a true loop delay: negative when stable.
 
-    Arguments and exceptions as of `mismatch_window`.
+    Arguments as for `mismatch_window`; BadModelError names one that does not fit.
 
-    x' = u, u = -x at a delay that is assumed rightly: that without delay, ln(1 - T) / T.
+    For x' = u, u = -x without mismatch, the rate is that without delay, ln(1 - T) / T:
 
     >>> round(predicted_growth_rate([[0]], [[1]], [[-1]], Timing(0.5, 0.5), assumed_s=3.2, delay_s=3.2), 6)
     -1.386294
@@ -117,7 +117,7 @@ def predicted_growth_rate(
 
 
 def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None) -> BoolArray | None:
-    """Which states are measured (n,), None if all are; BadModelError if that does not fit the loop."""
+    """Mask (n,) of the measured states, None if all are; BadModelError if it does not fit the loop."""
     A, _, K = loop
     mask = None if measured is None else np.array(measured, dtype=np.bool_)
     if mask is None or mask.all():

@@ -1,12 +1,12 @@
-"""Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
+"""Stability bounds for a varying delay tau(t) in x'(t) = A0 x(t) + A1 x(t - tau(t)).
 
-No exact bound is known. `varying_delay_bound` proves a smaller one, at most the margin for constant delays:
+No exact bound is known. `varying_delay_bound` proves a smaller one, which never exceeds the margin for constant delays:
 
 * |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
   F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
   whose published bounds this reproduces.
-* Any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
-  x' is at most h.
+* Any variation: the small-gain theorem for v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain
+  from x' is at most h.
 
 For a delay that stays near its mean, `gains.varying.jitter` may prove more.
 """
@@ -26,22 +26,22 @@ from gains.delay.constant import delay_margin
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4
-# bisection ends at the exact margin for constant delays, or at this many time constants 1 / (||A0|| + ||A1||)
+# upper end of the bisection, in time constants 1 / (||A0|| + ||A1||), unless the margin for constant delays is less
 _LONGEST = 1e3
-# states of one block; the unknowns grow with the square and the work with the sixth power
+# states of one block; the number of unknowns grows with the square and the work with the sixth power
 _LARGEST_BLOCK = 8
 
 
 def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     """A delay h (s) such that the loop is stable for every tau(t) in [0, h] with |tau'(t)| <= `rate`.
 
-    An infinite `rate` admits any variation, jumps included; the result is then the better of a functional that does not
-    use the rate and the small gain. `inf` if one functional proves stability whatever the length of the delay, 0 if the
+    An infinite `rate` admits any variation, jumps included; the result is then the better of the small-gain bound and
+    of a functional that does not use the rate. `inf` if a functional proves stability at any length of delay, 0 if the
     loop is unstable without delay. The functional found at the bound proves every shorter delay too. Finite bounds are
     sought up to 1000 / (||A0|| + ||A1||). A0 and A1 are real matrices (n, n) in 1/s with up to 8 states in a strongly
-    connected block, `rate` is mu >= 0; BadModelError if they are not.
+    connected block, `rate` is mu >= 0; BadModelError otherwise.
 
-    A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
+    For this loop the 2013 paper gives 6.059 s for a constant delay; the exact margin is 6.1726 s:
 
     >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
     6.06
@@ -57,14 +57,14 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     bounds_s: list[float] = []
     for block in blocks:
         now, late = balanced(*block.matrices)
-        # in a unit of time of its own numbers are near one
+        # scale time so that the numbers are near one
         unit = float(np.linalg.norm(now) + np.linalg.norm(late)) or 1.0
         bounds_s.append(_varying_bound_of_block(now / unit, late / unit, rate) / unit)
     return min(bounds_s)
 
 
 def _bisected(proved: Callable[[float], bool], upper: float) -> float:
-    """The largest number up to `upper`, to a part in 10^4, at which `proved` holds; 0 if at none."""
+    """The largest number up to `upper`, to a part in 10^4, at which `proved` holds; 0 if none is found."""
     if upper <= 0.0:
         return 0.0
     if proved(upper):
@@ -96,9 +96,9 @@ def _he(matrix: FloatArray) -> FloatArray:
 
 
 def _is_independent_of_length(now: FloatArray, late: FloatArray, rate: float) -> bool:
-    """V = x'Px + int over the delay of x'Qx proves stability for |tau'| <= rate < 1, whatever the length.
+    """Whether V = x'Px + int over the delay of x'Qx proves stability for |tau'| <= rate < 1 at any length of delay.
 
-    -[[A0'P + P A0 + Q, P A1], [A1'P, -(1 - mu) Q]] > 0.
+    The condition is -[[A0'P + P A0 + Q, P A1], [A1'P, -(1 - mu) Q]] > 0.
     """
     if rate >= 1.0:
         return False
@@ -113,12 +113,12 @@ def _is_independent_of_length(now: FloatArray, late: FloatArray, rate: float) ->
 
 
 def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate: float) -> bool:
-    """The inequalities of Seuret and Gouaisbaut 2013 for 0 <= tau <= h, |tau'| <= rate.
+    """Whether the inequalities of Seuret and Gouaisbaut 2013 hold for 0 <= tau <= h, |tau'| <= rate.
 
-    V = z'Pz + int_{t-tau}^t x'Qx + int_{t-h}^t x'Sx + h int int x''R x', z = (x, int_{t-tau}^t x, int_{t-h}^{t-tau} x),
-    and for a rate of inf Q = 0 and z = (x, int_{t-h}^t x), so that tau' does not appear. Its derivative is a quadratic
-    form in (x(t), x(t-tau), x(t-h), and the means of x over the two parts), affine in tau and tau': the corners of
-    their range suffice. The two integrals of R are joined by the reciprocally convex X.
+    V = z'Pz + int_{t-tau}^t x'Qx + int_{t-h}^t x'Sx + h int int x''R x', z = (x, int_{t-tau}^t x, int_{t-h}^{t-tau} x).
+    For an infinite rate Q = 0 and z = (x, int_{t-h}^t x), so that tau' does not appear. The derivative of V is a
+    quadratic form in (x(t), x(t-tau), x(t-h), and the means of x over the two parts), affine in tau and tau', so the
+    corners of their range suffice. The reciprocally convex X joins the two integrals of R.
     """
     n = now.shape[0]
     x, x_tau, x_h, mean_1, mean_2 = (np.eye(5 * n)[k * n : (k + 1) * n] for k in range(5))
@@ -131,7 +131,7 @@ def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate
 
     def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
         P, S, R, X = unknowns[:4]
-        # Jensen's and Wirtinger's parts of the integral of R
+        # the parts of the integral of R that come from Jensen's and Wirtinger's inequalities
         weight = np.kron(np.diag([1.0, 3.0]), R)
         joint = np.block([[weight, X], [X.T, weight]])
         results: list[FloatArray] = [P, S, R, joint.astype(np.float64)]
@@ -157,11 +157,11 @@ def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate
 
 
 def _small_gain_of_block(now: FloatArray, late: FloatArray, upper: float) -> float:
-    """A delay h up to `upper` such that the block is stable for every tau(t) in [0, h], however it varies.
+    """A delay h up to `upper` such that the block is stable for every tau(t) in [0, h] with any variation.
 
     h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
-    D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
-    real lemma with the unknown P = D'D.
+    D is a full matrix because the delay acts on all signals alike. The bounded real lemma with the unknown P = D'D
+    finds and proves the minimum.
     """
     total, (B, C) = now + late, factor_rank(late)
     n, r = B.shape

@@ -1,8 +1,8 @@
-"""The stability bound that covers the delay of a real link: constant, slowly varying or jumping.
+"""Stability bounds that cover the delay of a real link: constant, slowly varying or jumping.
 
-The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but smaller. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the
-least to the most demanding and returns the first that covers it.
+The margin for constant delays is exact but says nothing about varying delays; the bounds for varying delays are proved
+but smaller. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the least to
+the most demanding and returns the first that covers it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,9 +24,9 @@ from gains.varying.bounds import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]
 
-# frequencies at which the scaling is chosen, and at which the gain is then read, or read roughly in a search of gains
+# numbers of frequencies at which the scaling is chosen, the gain is evaluated, or roughly so in a search for gains
 _FREQUENCIES_SCALING, _FREQUENCIES_GAIN, _FREQUENCIES_ROUGH = 60, 4000, 600
-# halvings in the bisection of the gain that a scaling reaches; the gain is read again afterwards, so few are enough
+# bisections of the gain reached by a scaling; the gain is evaluated again afterwards, so few are enough
 _HALVINGS = 12
 # the gain is searched: its peak may be higher by this share
 _GRID_ERROR = 1e-3
@@ -34,25 +34,25 @@ _GRID_ERROR = 1e-3
 
 @dataclass(frozen=True)
 class CoveringBound:
-    """Which bound proves the loop stable under an observed jitter."""
+    """The bound that proves the loop stable under an observed jitter."""
 
     cover: Cover
     """"constant": the delay does not vary and lies in a window of the exact analysis. "rate": bounded rate of change,
-    delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any variation
-    from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same."""
+    delays from 0 up to `bound_s`. "spread": variation within ±(`bound_s` - mean) of the mean, at the observed rate.
+    "any": any variation from 0 up to `bound_s`. "none": no bound covers it; the loop may still be stable."""
     bound_s: float
-    """The largest delay that this bound admits, nan for "none"."""
+    """The largest delay that this bound covers, nan for "none"."""
 
 
 def bound_covering(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, spread_s: float, rate: float) -> CoveringBound:
     """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under an observed jitter.
 
-    The effective delay is `spread_s` from `mean_s` at most, and |d delay / dt| is `rate` (s/s) at most: inf for a delay
-    that jumps from message to message, as those of queued datagrams do. A sampled and held loop has a sawtooth of rate
-    1 with jumps. A0 and A1 as of `gains.varying.bounds.varying_delay_bound`. BadModelError if the matrices do not fit,
-    a block is too large, or the jitter is negative, not a number, or has a spread above the mean.
+    The effective delay is within `spread_s` of `mean_s`, and |d delay / dt| is at most `rate` (s/s): inf for a delay
+    that jumps from message to message, as with queued datagrams. The delay of a sampled and held loop is a sawtooth of
+    rate 1 with jumps. A0 and A1 as for `gains.varying.bounds.varying_delay_bound`. BadModelError if the matrices do not
+    fit, a block is too large, or the jitter is negative, not a number, or has a spread above the mean.
 
-    x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
+    x'(t) = -x(t - tau(t)) tolerates a constant delay near pi / 2, but not one that jumps:
 
     >>> [bound_covering([[0]], [[-1]], mean_s=1.4, spread_s=spread_s, rate=inf).cover for spread_s in (0.0, 0.15)]
     ['constant', 'none']
@@ -77,9 +77,9 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     """The spread (s) that the loop tolerates on both sides of a constant delay, however the delay varies within it.
 
     A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards. Jumps
-    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. At most the mean is
-    returned; 0 if the loop is unstable at the mean delay. BadModelError if the matrices do not fit, the mean is
-    negative or not finite, or the rate negative.
+    downwards do not count, so the sawtooth of a sampled and held loop has rate 1. The result is at most the mean, and 0
+    if the loop is unstable at the mean delay. BadModelError if the matrices do not fit, the mean is negative or not
+    finite, or the rate is negative.
 
     With A1 = B C and G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B the loop is stable for a spread below 1 / (g max over
     omega of ||D G(j omega) D^{-1}||), for any D; g = 1 if the rate is at most 1, else sqrt(7/4) (proof in
@@ -87,7 +87,7 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     allowed for what is missed: a search, not a proof. If `scaled` is False, D = I and the grid is coarse, as a search
     needs it.
 
-    x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
+    About 0.5 s, x'(t) = -x(t - tau(t)) has |omega / (j omega + e^{-j omega / 2})| of at most 1.59:
 
     >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
     [0.5, 0.47]
@@ -110,7 +110,7 @@ def _check(mean_s: float, spread_s: float, rate: float) -> None:
 
 
 def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled: bool) -> float:
-    """The reciprocal of the loop's largest gain about the mean delay."""
+    """The reciprocal of the block's largest gain about the mean delay."""
     now, late = matrices
     B, C = factor_rank(late)
     r = B.shape[1]
@@ -142,7 +142,7 @@ def _loop_gains(
 def _scaling(loops: ComplexArray) -> FloatArray:
     """D that makes the largest ||D G D^{-1}|| over the given loops nearly as small as possible."""
     r = loops.shape[1]
-    # a complex Hermitian matrix is positive definite if its real form of twice the size is
+    # a complex Hermitian matrix is positive definite if its real form, of twice the size, is
     real = np.concatenate(
         [np.concatenate([loops.real, -loops.imag], axis=2), np.concatenate([loops.imag, loops.real], axis=2)], axis=1
     )
@@ -160,7 +160,7 @@ def _scaling(loops: ComplexArray) -> FloatArray:
 
 
 def _scaling_for(real: FloatArray, gain: float) -> FloatArray | None:
-    """P > 0 with G*PG < gain^2 P for all loops in their real form (k, 2r, 2r), if there is one."""
+    """P > 0 with G*PG < gain^2 P for all loops in their real form (k, 2r, 2r), None if none is found."""
     both = np.eye(2)
 
     def inequalities(unknowns: Sequence[FloatArray]) -> list[FloatArray]:

@@ -1,37 +1,37 @@
-"""How far from the assumed instant set-points may act, with the predicted loop proved to be stable.
+"""How early or late set-points may act in a predicted loop that is proved stable.
 
 The station predicts as in `gains.sampled.prediction`. A set-point u_j, computed at the tick t_j = j T, is assumed to
-act at t_j + D, and the *delivery delay* D does not change. In truth it acts somewhere between t_j + D - e and
-t_j + D + l, independently of the others, but none overtakes another. The newest state known at tick k was sampled at
-s_k, which the station knows; s_k never falls. Let U(t) be the set-point computed at the latest tick at time t, u_act(t)
-the one that acts, and w(r) = u_act(r) - U(r - D). What is predicted at tick k, for the instant t_k + D, is
+act at t_j + D, with a constant *delivery delay* D. In fact it acts at any instant between t_j + D - e and t_j + D + l,
+independently of the others, but none overtakes another. The newest state known at tick k was sampled at s_k, which the
+station knows; s_k never decreases. Let U(t) be the set-point computed at the latest tick at time t, u_act(t) the one
+that acts, and w(r) = u_act(r) - U(r - D). The prediction at tick k, for the instant t_k + D, is
 
     x^_k = Y(t_k) + Phi(t_k + D - s_k) (x(s_k) - Y(s_k - D))    for any solution of Y' = A Y + B U,
 
-and x(r) - Y(r - D) obeys z' = A z + B w: only w drives it. So, exactly,
+and x(r) - Y(r - D) obeys z' = A z + B w: only w drives it. Exactly, therefore,
 
     x^_{k+1} = (Phi(T) + G K) x^_k + w_k,   w_k = int Phi(t_{k+1} + D - r) B w(r) dr over W_k = (s_k, s_{k+1}]:
 
-the loop without delay, and each instant of w disturbs it once, when the first state sampled after it is used. Now w is
-a sum of pulses: set-point j adds (u_j - u_{j-1}) or its negative between t_j + D and when it acts, over P_j. With
-c_kj = |P_j and W_k|, Schur's test bounds the gain from u_j - u_{j-1} to the sums c_kj (u_j - u_{j-1}) by
+the loop without delay. Each instant of w disturbs it once, when the first state sampled after it is used. w is a sum of
+pulses: set-point j adds (u_j - u_{j-1}) or its negative over P_j, between t_j + D and the instant at which it acts.
+With c_kj = |P_j and W_k|, Schur's test bounds the gain from u_j - u_{j-1} to the sums c_kj (u_j - u_{j-1}) by
 
     g^2 <= max over j of |P_j|  times  max over k of the sum over j of |P_j and W_k|.
 
-The first is max(e, l). At one instant either late pulses overlap or early ones, so the second is at most the number of
-control periods in W_k times the integral over one of them of the larger number. The loop is stable if
+The first is max(e, l). At any instant only late or only early pulses overlap, so the second is at most the number of
+control periods in W_k times the integral of the larger number over one of them. The loop is stable if
 
     g  sum over i of  b^i / i!  max over omega of || (1 - 1/z) K (z I - Phi(T) - G K)^{-1} A^i Phi(h) B ||  < 1,
 
-by small gain, where h is the middle of the intervals t_{k+1} + D - r, and b how far they may be from it. In a
-leader-follower tree errors pass down only, so each block is tested alone. The maxima are searched on a fine grid and
-refined, as that of `gains.varying.jitter`.
+by the small-gain theorem, where h is the middle of the intervals t_{k+1} + D - r, and b their largest distance from it.
+In a leader-follower tree errors only pass down, so each block is tested alone. The maxima are searched on a fine grid
+and refined: a search, not a proof.
 
 If every state has the same age, W_k lies at the same place in every period, and a constant mismatch leaves the loop
-time-invariant. Then e and l count from the true mean instead, and the loop in the norm is that with the mismatch.
+time-invariant. Then e and l count from the true mean, and the loop in the norm is the one with the mismatch.
 
 States that are not measured are computed from the commands. w reaches the measured states through them, which
-multiplies g by the integral of the modulus of the impulse response on that way.
+multiplies g by the integral of the modulus of the impulse response along that path.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,9 +51,9 @@ from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
 from gains.sampled.prediction import checked_mask
 
-# angles of the grid, and the lowest; how far halvings search; terms of the series in b that are smaller are left out
+# angles in the grid, and the lowest; bisections; relative size below which terms of the series in b are left out
 _ANGLES, _LOWEST, _HALVINGS, _SMALL = 2000, 1e-4, 50, 1e-9
-# instants of an impulse response, and time constants over which it is integrated
+# samples of an impulse response, and time constants over which it is integrated
 _INSTANTS, _SETTLED = 4000, 40.0
 # sums of periods and spreads are known to rounding
 _ROUNDING = 1e-9
@@ -61,13 +61,13 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PredictedSpread:
-    """How far set-points may act from their mean delay, in a loop that is predicted over `assumed_s`.
+    """Tolerated deviations of set-points from their mean delay, in a loop that is predicted over `assumed_s`.
 
     A, B, K, `timing`, `assumed_s` and `measured`, and the exceptions, are those of
-    `gains.sampled.prediction.mismatch_window`; the delays of all inputs of a block vary alike.
+    `gains.sampled.prediction.mismatch_window`; the delays of all inputs of a block vary together.
 
-    A follower with the gains of `triangle5`, predicted over 0.6 s. If its telemetry is always equally old, its
-    set-points may act 0.14 s early or late; if that also varies by 50 ms, a third as much:
+    A follower with the gains of `triangle5` is predicted over 0.6 s. With telemetry of constant age, its set-points may
+    act 0.14 s early or late; if that age also varies by 50 ms, a third of this:
 
     >>> A, B, K = [[0, -1], [0, 0]], [[0], [1]], [[5.608, -3.408]]
     >>> spread = PredictedSpread(A, B, K, Timing(0.02, 0.02), assumed_s=0.6)
@@ -83,16 +83,16 @@ class PredictedSpread:
     measured: Sequence[bool] | None = None
 
     def bound_s(self, *, mean_s: float, telemetry_s: float = 0.0) -> float:
-        """How far (s) each set-point may act from its mean, early or late, with the loop proved stable.
+        """How early or late (s) each set-point may act relative to its mean, with the loop proved stable.
 
-        `mean_s` is the mean loop delay, at most which is returned. `telemetry_s` is how far the delay of telemetry may
-        be from its mean, to both sides. 0 if nothing is proved.
+        `mean_s` is the mean loop delay and the largest possible result. `telemetry_s` is the largest deviation of the
+        telemetry delay from its mean, to either side. 0 if nothing is proved.
         """
         if not (0.0 <= mean_s < inf and 0.0 <= telemetry_s < inf):
             raise BadModelError(f"mean_s is {mean_s}, telemetry_s {telemetry_s}; numbers of seconds >= 0 are wanted")
         off_s = mean_s - seconds("assumed_s", self.assumed_s)
         period_s, regular = self.timing.control_s, telemetry_s == 0.0 and self.timing.ticks == 1
-        # the age of the newest state, held until the next, and how long none newer is known
+        # by how much the age of the newest state varies, held until the next, and how long no newer one may arrive
         varies_s = 0.0 if regular else 2.0 * telemetry_s + self.timing.telemetry_s
         gap_s = self.timing.telemetry_s * (ceil((period_s + varies_s) / self.timing.telemetry_s - _ROUNDING) - 1)
         windows = 1 if regular else ceil(gap_s / period_s - _ROUNDING)
@@ -109,7 +109,7 @@ class PredictedSpread:
 
     @cached_property
     def _blocks(self) -> list[tuple[HeldPlant, list[float]]]:
-        """Each block, and its `_peaks` without mismatch."""
+        """Each block with its `_peaks` without mismatch."""
         loop = checked_loop(self.A, self.B, self.K)
         mask = checked_mask(loop, self.measured)
         plants = held_blocks(*loop, period_s=self.timing.control_s, measured=mask)
@@ -117,7 +117,7 @@ class PredictedSpread:
 
 
 def _most_s(peaks: list[float], apart_s: float) -> float:
-    """The least g (s) at which the sum over the powers of b = `apart_s` is one; 0 if the loop is unstable."""
+    """The g (s) at which the stability sum, over the powers of b = `apart_s`, is one; 0 if the loop is unstable."""
     if not peaks:
         return 0.0
     factors = np.cumprod([1.0, *(apart_s / power for power in range(1, len(peaks)))])
@@ -128,7 +128,7 @@ def _most_s(peaks: list[float], apart_s: float) -> float:
 def _peaks(plant: HeldPlant, timing: Timing, assumed_s: float, mean_s: float) -> list[float]:
     """Largest gains from sums of pulses to u_j - u_{j-1} in one block, for each power of b; none if it is unstable."""
     if mean_s == assumed_s:
-        radius = block_radius(plant, 0.0)  # the loop behind the delay is that without
+        radius = block_radius(plant, 0.0)  # the loop behind the delay is the loop without delay
     else:
         radius = lifted_radius(plant, timing, delay_s=mean_s, predictor=Predictor(plant, assumed_s))
     if radius >= 1.0:
@@ -152,7 +152,7 @@ def _peaks(plant: HeldPlant, timing: Timing, assumed_s: float, mean_s: float) ->
 
 
 def _rows(plant: HeldPlant, angle: FloatArray, assumed_s: float, mean_s: float) -> ComplexArray:
-    """What a disturbance of the predicted state (n,) does to u_j - u_{j-1}, shape (k, r, n), at z = e^{j angle}."""
+    """Response of u_j - u_{j-1} to a disturbance of the predicted state (n,), shape (k, r, n), at z = e^{j angle}."""
     z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]
     Phi, G = (maps[0] for maps in plant.transition(np.array([plant.period_s])))
     resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
@@ -164,7 +164,7 @@ def _rows(plant: HeldPlant, angle: FloatArray, assumed_s: float, mean_s: float) 
 
 
 def _integral(A: FloatArray, B: FloatArray, computed: BoolArray) -> float:
-    """int ||e^{A t} B|| dt of the states that are computed from the commands; 0 if there are none."""
+    """int ||e^{A t} B|| dt for the states that are computed from the commands; 0 if there are none."""
     own, entry = A[np.ix_(computed, computed)], B[computed]
     if not computed.any():
         return 0.0
@@ -175,16 +175,16 @@ def _integral(A: FloatArray, B: FloatArray, computed: BoolArray) -> float:
 
 
 def _gain(early_s: float, late_s: float, period_s: float, windows: int) -> float:
-    """g (s): what set-points that act so much early or late at most do to the loop, over so many control periods."""
+    """The bound g (s) for set-points that act at most so early or late, with `windows` control periods in W_k."""
     early, late = (max(0.0, each_s) / period_s for each_s in (early_s, late_s))
     most, whole = max(early, late), floor(early)
-    # the numbers of early and of late pulses over an instant are these, or one more for a part of each period
+    # the numbers of early and of late pulses at an instant are these, or one more during part of each period
     larger = whole + min(1.0, early + late - 2 * whole) if whole == floor(late) else most
     return period_s * (most * larger * windows) ** 0.5
 
 
 def _bisected(proved: Callable[[float], bool], most_s: float) -> float:
-    """The largest number up to `most_s` at which `proved` holds, if it holds below; 0 if nowhere."""
+    """The largest number up to `most_s` at which `proved` holds, assuming that it then holds below; 0 if nowhere."""
     if proved(most_s):
         return most_s
     low_s, high_s = 0.0, most_s
