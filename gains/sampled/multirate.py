@@ -146,8 +146,8 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     If the slower period is a multiple of the faster one, the margin is the exact one of `gains.sampled.constant`. If
     the continuous margin exceeds thirty slower periods, the margin is that of the slower period alone. Otherwise the
     loop delay is raised in steps, smaller ones where the loop comes near instability, up to three times the margin of
-    the continuous loop plus ten slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
-    `gains.sampled.constant.sampled_delay_margin`.
+    the continuous loop plus ten slower periods: a search, not a proof. Arguments as for `multirate_growth_rate`,
+    exceptions as for `gains.sampled.constant.sampled_delay_margin`.
 
     x' = u, u = -x has a margin of 1 s if either of the two periods is 1 s and the other divides it:
 

@@ -19,6 +19,11 @@ from scenarios.signing.link import SignedLink
 _LARGEST_DATAGRAM = 2048
 _STREAMS_WITH_POSITION = (0, 6)
 """MAV_DATA_STREAM_ALL and MAV_DATA_STREAM_POSITION."""
+_USED_MESSAGES = (
+    *(mavlink.HEARTBEAT, mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT, mavlink.GPS_GLOBAL_ORIGIN),
+    *(mavlink.POSITION_TARGET_LOCAL_NED, mavlink.TIMESYNC, mavlink.EKF_STATUS_REPORT, mavlink.ESTIMATOR_STATUS),
+)
+"""Messages whose rates the other station may not change: the flight uses them."""
 _DATAGRAMS_A_STEP = 64
 """Most datagrams read from the other station per step. Others wait; the kernel drops what exceeds its buffer."""
 
@@ -64,11 +69,12 @@ class Mirror:
     def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
         """The permitted frames of the other station, each for the vehicle it is addressed to, or for all.
 
-        They go only to vehicles in guided flight: one that was never commanded would accept the other station as its
-        own. Requests that change the rate of the telemetry used for control are refused, because displays ask for only
-        a few positions a second when they connect.
+        They go only to vehicles that are, or were, in guided flight: one that was never commanded would accept the
+        other station as its own. Requests that change the rate of the telemetry used for control are refused, because
+        displays ask for only a few positions a second when they connect.
         """
-        own = {vehicle.wire_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
+        flown = (vehicle.guided or vehicle.has_been_guided for vehicle in vehicles)
+        own = {v.wire_id: v.address if has_flown else None for v, has_flown in zip(vehicles, flown, strict=True)}
         outgoing: list[Outgoing] = []
         for frame in self._received(now_ns):
             name = mavlink.message_name(frame.msg_id)
@@ -100,11 +106,11 @@ class Mirror:
 
 
 def _sets_our_rate(frame: mavlink.Frame) -> bool:
-    """Whether a frame sets the rate of LOCAL_POSITION_NED, alone or as part of a stream."""
+    """Whether a frame sets the rate of a message that the flight uses, alone or with the stream of positions."""
     name = mavlink.message_name(frame.msg_id)
     if name not in ("REQUEST_DATA_STREAM", "COMMAND_LONG", "COMMAND_INT"):
         return False
     fields = mavlink.named_fields(frame)
     if name == "REQUEST_DATA_STREAM":
         return fields["req_stream_id"] in _STREAMS_WITH_POSITION
-    return fields["command"] == SET_MESSAGE_INTERVAL and fields["param1"] == mavlink.LOCAL_POSITION_NED
+    return fields["command"] == SET_MESSAGE_INTERVAL and fields["param1"] in _USED_MESSAGES

@@ -243,7 +243,7 @@ class RemoteVehicle:
         self.startup = startup
         self.kind = startup.kind
         self._launched = not self.kind.piloted
-        self._has_been_guided = self._take_off_sent = False
+        self.has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
         """When the first heartbeat after a long silence arrived. Its sequence number does not reveal a replay."""
         self._land = land
@@ -326,7 +326,7 @@ class RemoteVehicle:
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
         if self.taken_over and not self.startup.has_landed:
-            left = "left" if self._has_been_guided else "is armed and not in"
+            left = "left" if self.has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         return self._next_step().missing
 
@@ -428,7 +428,7 @@ class RemoteVehicle:
         if self.external:
             return
         if mode == kind.guided_mode:
-            self._has_been_guided = True
+            self.has_been_guided = True
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
         elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
@@ -444,7 +444,7 @@ class RemoteVehicle:
     def _takes_off_by(self, mode: int) -> bool:
         """Whether a mode belongs to the commanded take-off: first the take-off mode, then hold at the top."""
         kind = self.kind
-        if kind.guided_first or self._has_been_guided:
+        if kind.guided_first or self.has_been_guided:
             return False
         if mode == kind.take_off_mode:
             return self._take_off_sent

@@ -16,6 +16,8 @@ from mavsdk.plugins.telemetry import Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.drive.guard import Guard
+from gcs.autopilot.kinds import ARDUCOPTER
+from gcs.autopilot.startup import AutopilotStartup
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
 from gcs.link.startup import LaunchedStartup
@@ -194,7 +196,8 @@ def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
     mav = dialect.MAVLink(None, srcSystem=255)
     stream, long = dialect.MAVLink_request_data_stream_message, dialect.MAVLink_command_long_message
     whole = dialect.MAVLink_command_int_message(1, 1, 0, 511, 0, 0, 32, 250_000, 0, 0, 0, 0, 0)
-    slowing = [stream(1, 1, 0, 3, 1), stream(1, 1, 6, 3, 1), long(1, 1, 511, 0, 32, 250_000, 0, 0, 0, 0, 0), whole]
+    rates = [long(1, 1, 511, 0, message, 250_000, 0, 0, 0, 0, 0) for message in (32, 33, 85, 111)]
+    slowing = [stream(1, 1, 0, 3, 1), stream(1, 1, 6, 3, 1), *rates, whole]
     files = dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, [0] * 251)
     other_wishes = [stream(1, 1, 10, 10, 1), long(1, 1, 511, 0, 242, 1_000_000, 0, 0, 0, 0, 0), files]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -209,7 +212,23 @@ def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
     assert [data for data, _ in passed] == sent[len(slowing) :]
     refused = "refused {} about the rate of the telemetry used for control"
     assert mirror.counters[refused.format("REQUEST_DATA_STREAM")] == 2
-    assert mirror.counters[refused.format("COMMAND_LONG")] == mirror.counters[refused.format("COMMAND_INT")] == 1
+    assert mirror.counters[refused.format("COMMAND_LONG")] == len(rates)
+    assert mirror.counters[refused.format("COMMAND_INT")] == 1
+
+
+def test_a_vehicle_that_left_guided_flight_is_not_cut_off() -> None:
+    vehicle = RemoteVehicle(1, startup=AutopilotStartup(altitude_m=5.0, telemetry_hz=20.0))
+    vehicle.address, guided, loiter = ("127.0.0.1", 9, 0), ARDUCOPTER.guided_mode, 5
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with Mirror(*other.getsockname(), commands=True) as mirror:
+            mirror.forward([b"hello"], 0)
+            _, address = other.recvfrom(2048)
+            land = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(20, target_system=1), sequence=0)
+            for mode, passed_on in ((loiter, []), (guided, [land]), (loiter, [land])):
+                vehicle.heartbeat((mode, 2, 3, 128, 4, 3), 0)  # an armed ArduCopter in flight
+                other.sendto(land, address)
+                assert [data for data, _ in mirror.passed_on([vehicle], 0)] == passed_on
 
 
 def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
