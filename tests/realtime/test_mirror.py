@@ -15,9 +15,9 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.telemetry import Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.drive.guard import Guard
 from gcs.autopilot.kinds import ARDUCOPTER
 from gcs.autopilot.startup import AutopilotStartup
+from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
 from gcs.link.startup import LaunchedStartup
