@@ -175,8 +175,12 @@ def checks_of(result: CampaignResult) -> list[Check]:
 
 def print_disturbances(result: DisturbanceResult) -> None:
     console = _wide_console()
+
+    def errors_of(o: DisturbanceOnset) -> str:
+        return "one follower" if len(o.vehicles) == 2 else "all vehicles"
+
     columns: dict[str, Callable[[DisturbanceOnset], str]] = {
-        "errors of": lambda o: "one follower" if len(o.vehicles) == 2 else "all vehicles",
+        "errors of": errors_of,
         "disturbance": lambda o: o.kind,
         "radius, 1/s": lambda o: number_text(o.radius_1_s, ".5f"),
         "at, rad/s": lambda o: f"{o.frequency_rad_s:.2f}",
@@ -188,6 +192,8 @@ def print_disturbances(result: DisturbanceResult) -> None:
     title = f"disturbances that break {result.scenario} at {ms_text(result.loop_delay_s)} of loop delay"
     console.print(table_of(result.onsets, columns, title=title))
     console.print("dynamic: any stable filter, alpha is its radius; constant: a matrix, the same north and east")
+    for onset in (onset for onset in result.onsets if onset.missing):
+        console.print(f"onset    {errors_of(onset)}, {onset.kind}, not found: {onset.missing}")
     if result.failure:
         console.print(f"failed   {result.failure}")
 

@@ -99,8 +99,8 @@ def stress(
 
     Simulated autopilots fly in virtual time, after they have shown their response, which the margin includes.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, or a trial flown again
-    differs.
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, no onset with
+    --disturbance was measured, or a trial flown again differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]

@@ -49,15 +49,17 @@ def test_an_onset_is_asserted_no_finer_than_it_is_known(difference: float, error
 
 
 def test_a_disturbance_is_asserted_no_finer_than_it_is_known() -> None:
-    def found(error: float, difference: float = 0.0) -> DisturbanceOnset:
+    def found(error: float, difference: float | None = 0.0) -> DisturbanceOnset:
         return DisturbanceOnset(
-            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0, onset_1_s=2.0 * (1.0 + difference),
-            error_1_s=2.0 * error, difference=difference, flights=3,
+            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0,
+            onset_1_s=None if difference is None else 2.0 * (1.0 + difference),
+            error_1_s=2.0 * error, difference=difference, flights=3, measured=3,
         )  # fmt: skip
 
     assert missed([found(0.04), found(0.04)], 0.05) is None
     assert missed([found(0.06), found(0.04)], 0.05) == "1 of 2 onsets are known less well than to 5.000% of the radius"
     assert missed([found(0.0, 0.06)], 0.05) == "1 of 1 onsets are farther than 5.000% from the radius"
+    assert missed([found(0.0, None), found(0.0)], 0.05) == "1 of 2 onsets are not measured"
 
 
 @pytest.mark.parametrize(
