@@ -42,7 +42,9 @@ def stress(
     jitter: Annotated[
         str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
     ] = "",
-    loss: Annotated[str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way")] = "",
+    loss: Annotated[
+        str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; in place of bursts, too")
+    ] = "",
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     prediction: Annotated[
         str,

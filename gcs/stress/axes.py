@@ -90,7 +90,8 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     """The scenario at one point of a campaign.
 
     A rate applies to control, to telemetry if both rates were equal, and on board in proportion. Jitter keeps the
-    distribution of a link that has one; elsewhere it is uniform within ± the value.
+    distribution of a link that has one; elsewhere it is uniform within ± the value. Losses are independent, also where
+    a link had bursts.
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
@@ -109,7 +110,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         change = partial(_with_jitter, scale_s=coordinates["jitter"])
         scenario = scenario.with_links(change, change)
     if "loss" in coordinates:
-        lossy = partial(Link.model_copy, update={"loss_probability": coordinates["loss"]})
+        lossy = partial(Link.model_copy, update={"loss_probability": coordinates["loss"], "loss_bursts": None})
         scenario = scenario.with_links(lossy, lossy)
     return scenario
 
