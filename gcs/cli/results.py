@@ -69,9 +69,10 @@ def print_result(result: CampaignResult, folder: Path) -> None:
             f"         {_ms(onset.link_delay_s)} of link delay, up + down, for {whose}{left}: vehicle {onset.critical} "
             f"waits {_ms(onset.waiting_s)} for {waits_for}{breaks}"
         )
-    if result.onset_missing:
-        found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
-        console.print(f"onset    {found}: {result.onset_missing}")
+    found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
+    reasons = (found, result.onset_missing), ("of shorter delays not found", result.onset_shorter_missing)
+    for found, why in (each for each in reasons if each[1]):
+        console.print(f"onset    {found}: {why}")
     if result.curve_error is not None:
         console.print(f"curve    measured and predicted growth differ by at most {result.curve_error:.3%} of the range")
     if result.past_limits:

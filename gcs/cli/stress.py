@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from gcs.stress.axes import Axis
     from gcs.stress.campaign import Fly
     from gcs.stress.report import CampaignResult
-    from gcs.stress.study import Onset, Study
-    from gcs.stress.trial import Outcome
+    from gcs.stress.study import NoOnset, Onset, Study
+    from gcs.stress.trial import Outcome, Run
 
 _AXIS = "FROM:TO:N"
 _OUT_WANTED = "a new or empty folder, or --resume"
@@ -305,7 +305,7 @@ def _campaign(
     from gcs.runs.record import SCENARIO_FILE, write_whole
     from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
-    from gcs.stress.study import NoOnset, find_onset
+    from gcs.stress.study import NoOnset
     from gcs.views.console import progress
     from scenarios.files import dump
     from scenarios.own_code import write_code
@@ -316,7 +316,7 @@ def _campaign(
         check_study("--resume", out / TRIALS_FILE, scenario=scenario)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
-    onset_shorter: Onset | None = None
+    onset_shorter: Onset | NoOnset | None = None
     with raised(), contextlib.ExitStack() as stack:
         fly = stack.enter_context(workers)
         if out is None:
@@ -333,11 +333,10 @@ def _campaign(
                 sweep = run_campaign(trials, store, fly, ended=begin("flights"))
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
-                onset = find_onset(study, run, tolerance=tolerance, vehicle=vehicle)
-                if (study.window_s if vehicle is None else window_of(study.plan, vehicle))[0] > 0.0:
-                    onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
-        except NoOnset as reason:
-            onset = reason
+                onset = _onset_or_why(study, run, tolerance=tolerance, vehicle=vehicle)
+                begins_s, _ = study.window_s if vehicle is None else window_of(study.plan, vehicle)
+                if not isinstance(onset, NoOnset) and begins_s > 0.0:
+                    onset_shorter = _onset_or_why(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
         except KeyboardInterrupt:
             typer.echo(store.resume, err=True)
             raise
@@ -349,6 +348,17 @@ def _campaign(
     if why := write_report(folder, result, study=study, axes=axes):
         typer.echo(f"no figures: {why}", err=True)
     return result, folder
+
+
+def _onset_or_why(
+    study: "Study", run: "Run", *, tolerance: float, vehicle: int | None, shorter: bool = False
+) -> "Onset | NoOnset":
+    from gcs.stress.study import NoOnset, find_onset
+
+    try:
+        return find_onset(study, run, tolerance=tolerance, shorter=shorter, vehicle=vehicle)
+    except NoOnset as reason:
+        return reason
 
 
 def _duration_text(seconds: float) -> str:

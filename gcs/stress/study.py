@@ -31,6 +31,7 @@ _LARGEST_ERROR = 0.1
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 _AT_ONCE = "the formation breaks without any link delay"
+_NONE_SHORT = "no link delay is short enough to break the formation"
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class Onset:
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
     """No delay breaks the formation, or none was found; the text is one line that says why.
 
-    `as_predicted` says that the margin has no limit and that the flights confirm it.
+    `as_predicted` says that the prediction has none either, and that the flights confirm it.
     """
 
     def __init__(self, line: str, *, as_predicted: bool = False) -> None:
@@ -200,16 +201,20 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
 def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:
     """That waiting alone takes longer than the loop delay of the onset."""
-    what = "no link delay is short enough to break the formation" if shorter else _AT_ONCE
+    what = _NONE_SHORT if shorter else _AT_ONCE
     at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
     return NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
 
 
 def _not_located(flights: Sequence[Outcome], scattered: Zero | None, *, shorter: bool) -> NoOnset:
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
-    flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
+    count = f"{len(flights)} flight{'s' * (len(flights) != 1)}"
+    flown = f"in {count} with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
     if not shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) > 0.0 for own in flights):
         return NoOnset(f"{_AT_ONCE}: errors grow {flown}")
+    if shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) < 0.0 for own in flights):
+        expected = all((own.predicted_growth_1_s or 0.0) < 0.0 for own in flights)
+        return NoOnset(f"{_NONE_SHORT}: errors decay {flown}", as_predicted=expected)
     if scattered is not None:
         at = f"{scattered.varied:.3f} s ± {scattered.error:.3f} s of loop delay"
         return NoOnset(f"growth rates scatter too much {flown}: they pass zero at {at}")
