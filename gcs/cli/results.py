@@ -63,11 +63,12 @@ def print_result(result: CampaignResult, folder: Path) -> None:
             console.print(f"         {_ms(onset.predicted_continuous_s)} {continuous}")
         whose = f"vehicle {onset.vehicle} alone" if onset.vehicle is not None else "every vehicle"
         left_s = onset.link_delay_left_s
-        waits_for = "the control tick" if onset.waiting_s <= result.period_s else "jitter and the control tick"
+        least, most = map(_ms, onset.link_delay_range_s)
+        between = "" if least == most else f" ({least} to {most} by the waits of single flights)"
         left = "" if left_s is None else f", {_ms(left_s, form='+.2f')} from the scenario's"
         console.print(
-            f"         {_ms(onset.link_delay_s)} of link delay, up + down, for {whose}{left}: vehicle {onset.critical} "
-            f"waits {_ms(onset.waiting_s)} for {waits_for}{breaks}"
+            f"         {_ms(onset.link_delay_s)}{between} of link delay, up + down, for {whose}{left}: vehicle "
+            f"{onset.critical} waits {_ms(onset.waiting_s)} for {onset.waits_for}{breaks}"
         )
     found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
     reasons = (found, result.onset_missing), ("of shorter delays not found", result.onset_shorter_missing)
