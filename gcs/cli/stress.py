@@ -40,7 +40,10 @@ def stress(
         list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="the same of one vehicle; may be repeated")
     ] = None,
     jitter: Annotated[
-        str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
+        str,
+        typer.Option(
+            metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter, not for traces"
+        ),
     ] = "",
     loss: Annotated[
         str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; in place of bursts, too")

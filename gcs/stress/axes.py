@@ -91,7 +91,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
 
     A rate applies to control, to telemetry if both rates were equal, and on board in proportion. Jitter keeps the
     distribution of a link that has one; elsewhere it is uniform within ± the value. Losses are independent, also where
-    a link had bursts.
+    a link had bursts. Raises InputError for jitter in place of measured delays, which have no scale.
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
@@ -156,9 +156,13 @@ def _with_rate(scenario: Scenario, hz: float) -> Scenario:
 
 
 def _with_jitter(link: Link, scale_s: float) -> Link:
+    if link.jitter is not None and link.jitter.distribution == "trace":
+        raise InputError(
+            "--jitter: read links with a trace of measured delays, wanted jitter that has a scale, or none"
+        )
     if scale_s == 0.0:
         return link.model_copy(update={"jitter": None})
-    if link.jitter is not None and link.jitter.scale_s is not None:
+    if link.jitter is not None:
         return link.model_copy(update={"jitter": link.jitter.model_copy(update={"scale_s": scale_s})})
     return link.model_copy(update={"jitter": Jitter(distribution="uniform", scale_s=scale_s)})
 

@@ -57,6 +57,13 @@ def test_jitter_keeps_the_distribution_that_a_link_has() -> None:
     assert down.jitter == Jitter(distribution="uniform", scale_s=0.02)
 
 
+def test_jitter_does_not_replace_measured_delays() -> None:
+    traced = Link(jitter=Jitter(distribution="trace", trace_s=(0.01, 0.2)))
+    own = SCENARIO.model_copy(update={"links": SCENARIO.links.model_copy(update={"up": traced})})
+    with pytest.raises(InputError, match="--jitter: read links with a trace of measured delays, wanted jitter with"):
+        at_coordinates(own, {"jitter": 0.02})
+
+
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_loss_takes_the_place_of_bursts(loss: float) -> None:
     bursty = Link(loss_bursts=LossBursts(to_bad_probability=0.02, to_good_probability=0.5))
