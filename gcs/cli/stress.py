@@ -316,7 +316,7 @@ def _campaign(
     scenario = dump(study.plan.scenario)
     if resume:
         assert out is not None
-        check_study("--resume", out / TRIALS_FILE, scenario=scenario)
+        check_study("--resume", out / TRIALS_FILE, scenario=study.plan.scenario)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
     onset_shorter: Onset | NoOnset | None = None

@@ -28,6 +28,10 @@ from gcs.runs.record import SCENARIO_FILE, RecordLog, write_parquet
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
+from scenarios.files import dump
+from scenarios.keys.own import CodeFile
+from scenarios.own_code import as_flown
+from scenarios.schema import Scenario
 
 TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"
@@ -85,8 +89,8 @@ def trials_of(folder: Path) -> Store[Outcome]:
     return Store(folder / TRIALS_FILE, Outcome, lambda outcome: outcome.id)
 
 
-def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | None = None) -> None:
-    """Refuse a folder without the file of a kind of study, or with a study of another scenario; `scenario` is TOML.
+def check_study(flag: str, file: Path, kind: str = "campaign", scenario: Scenario | None = None) -> None:
+    """Refuse a folder without the file of a kind of study, or with a study of another scenario or code.
 
     Raises InputError with what was read and what was wanted.
     """
@@ -94,8 +98,12 @@ def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | N
         if not file.with_name(name).is_file():
             raise InputError(f"{flag}: read no {name} in {file.parent}, wanted the folder of a {kind}")
     known = file.with_name(SCENARIO_FILE)
-    if scenario is not None and known.read_text(encoding="utf-8") != scenario:
+    if scenario is not None and known.read_text(encoding="utf-8") != dump(scenario):
         raise InputError(f"{flag}: {file.parent} holds a {kind} of another scenario or loop, wanted {known}")
+    for code in () if scenario is None else as_flown(scenario).code:
+        kept = file.with_name(code.name)
+        if not kept.is_file() or CodeFile(name=code.name, text=kept.read_text(encoding="utf-8")).sha256 != code.sha256:
+            raise InputError(f"{flag}: {file.parent} holds a {kind} flown with other code, wanted {kept}")
 
 
 def run_campaign(

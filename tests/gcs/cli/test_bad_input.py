@@ -76,6 +76,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"fly {CHAIN} --virtual --out README.md", "--out: README.md: File exists, wanted a folder that can"),
         (f"fly {CHAIN} --virtual --out {{run}}", "run is not empty, wanted a new or empty folder"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
+        (f"design {CHAIN} --at 0.3 --save {{run}}/scenario.toml", "scenario.toml: read a file that exists, wanted a"),
     ],
 )
 def test_what_cannot_be_used_is_refused_before_the_work(

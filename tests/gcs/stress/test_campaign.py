@@ -13,9 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from gcs.errors import InputError
+from gcs.runs.record import SCENARIO_FILE
 from gcs.stress.campaign import (
     PARQUET_FILE,
     TRIALS_FILE,
+    check_study,
     dask_workers,
     local_workers,
     run_campaign,
@@ -24,6 +26,9 @@ from gcs.stress.campaign import (
 )
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
+from scenarios.files import dump
+from scenarios.own_code import write_code
+from tests.support.fleets.own_code import LAW, coded
 from tests.support.fleets.stress_pair import trials
 from tests.support.paths import ROOT
 
@@ -79,6 +84,16 @@ def test_two_campaigns_do_not_fly_in_one_folder(tmp_path: Path) -> None:
         trials_of(tmp_path)
     first.close()
     trials_of(tmp_path).close()
+
+
+def test_a_campaign_is_not_resumed_with_other_code(tmp_path: Path) -> None:
+    file, first = tmp_path / TRIALS_FILE, coded(law="soft")
+    (tmp_path / SCENARIO_FILE).write_text(dump(first))
+    write_code(first, tmp_path)
+    file.touch()
+    check_study("--resume", file, scenario=first)
+    with pytest.raises(InputError, match=r"--resume: .* holds a campaign flown with other code, wanted .*own\.py"):
+        check_study("--resume", file, scenario=coded(LAW.replace("-5.0", "-4.0"), law="soft"))
 
 
 def test_a_line_cut_short_costs_its_own_trial_only(tmp_path: Path) -> None:
