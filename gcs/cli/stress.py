@@ -186,6 +186,9 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, seeds: int, *, s
         raise InputError(f"--seeds: read {seeds}, wanted it with an axis: a search draws its own seeds")
     if len(given) > 2:
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
+    vehicles = [text.partition("=")[0] for option, text in given if option == "--delay-of"]
+    if len(set(vehicles)) < len(vehicles):
+        raise InputError(f"--delay-of: read vehicle {vehicles[0]} twice, wanted two vehicles")
     if prediction and (len(given) != 2 or searches):
         raise InputError(f"--prediction: read {prediction}, wanted it with two other axes (a map) and no search")
 
