@@ -1,8 +1,8 @@
 """Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
 The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
-finished trial. A later campaign resumes it: a trial whose id is stored is not flown again, unless `refly` is asked to:
-in virtual time it is then the same to the last bit, with files and a Rerun recording.
+finished trial. A later campaign resumes it: a trial whose id is stored is not flown again, unless it ended in an error,
+or `refly` is asked to: in virtual time it is then the same to the last bit, with files and a Rerun recording.
 """
 
 import contextlib
@@ -109,12 +109,12 @@ def check_study(flag: str, file: Path, kind: str = "campaign", scenario: Scenari
 def run_campaign(
     trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] = lambda _: None
 ) -> list[Outcome]:
-    """Return the outcomes of trials in the given order; those not stored are flown, each once.
+    """Return the outcomes of trials in the given order; those not stored, or with an error, are flown, each once.
 
     `ended` is called after each trial with the number still to come. Raises KeyboardInterrupt also if Ctrl-C
     ended a flight in real time; that flight does not count as flown.
     """
-    missing = {trial.id: trial for trial in trials if trial.id not in store.flown}
+    missing = {t.id: t for t in trials if t.id not in store.flown or store.flown[t.id].error is not None}
     left = len(missing)
     try:
         for outcome in fly(list(missing.values())) if missing else ():

@@ -119,6 +119,19 @@ def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> N
     assert left == [2, 1, 0]
 
 
+def test_a_resumed_campaign_flies_failed_trials_again(tmp_path: Path) -> None:
+    wanted, store = trials(2), trials_of(tmp_path)
+    store.add(replace(fly_trial(wanted[0]), error="MemoryError"))
+    store.add(fly_trial(wanted[1]))
+    store.close()
+    fly, store = Here(), trials_of(tmp_path)
+    outcomes = run_campaign(wanted, store, fly)
+    store.close()
+    assert fly.flown == [wanted[0].id]
+    assert [outcome.error for outcome in outcomes] == [None, None]
+    assert trials_of(tmp_path).flown[wanted[0].id].error is None
+
+
 def test_the_table_has_trials_as_rows_axes_as_columns(tmp_path: Path) -> None:
     outcomes = [fly_trial(trial) for trial in trials(2, bad=1)]
     write_table(outcomes, tmp_path)
