@@ -63,15 +63,17 @@ def print_result(result: CampaignResult, folder: Path) -> None:
             console.print(f"         {_ms(onset.predicted_continuous_s)} {continuous}")
         whose = f"vehicle {onset.vehicle} alone" if onset.vehicle is not None else "every vehicle"
         left_s = onset.link_delay_left_s
-        waits_for = "the control tick" if onset.waiting_s <= result.period_s else "jitter and the control tick"
+        least, most = map(_ms, onset.link_delay_range_s)
+        between = "" if least == most else f" ({least} to {most} by the waits of single flights)"
         left = "" if left_s is None else f", {_ms(left_s, form='+.2f')} from the scenario's"
         console.print(
-            f"         {_ms(onset.link_delay_s)} of link delay, up + down, for {whose}{left}: vehicle {onset.critical} "
-            f"waits {_ms(onset.waiting_s)} for {waits_for}{breaks}"
+            f"         {_ms(onset.link_delay_s)}{between} of link delay, up + down, for {whose}{left}: vehicle "
+            f"{onset.critical} waits {_ms(onset.waiting_s)} for {onset.waits_for}{breaks}"
         )
-    if result.onset_missing:
-        found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
-        console.print(f"onset    {found}: {result.onset_missing}")
+    found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
+    reasons = (found, result.onset_missing), ("of shorter delays not found", result.onset_shorter_missing)
+    for found, why in (each for each in reasons if each[1]):
+        console.print(f"onset    {found}: {why}")
     if result.curve_error is not None:
         console.print(f"curve    measured and predicted growth differ by at most {result.curve_error:.3%} of the range")
     if result.past_limits:
@@ -175,8 +177,12 @@ def checks_of(result: CampaignResult) -> list[Check]:
 
 def print_disturbances(result: DisturbanceResult) -> None:
     console = _wide_console()
+
+    def errors_of(o: DisturbanceOnset) -> str:
+        return "one follower" if len(o.vehicles) == 2 else "all vehicles"
+
     columns: dict[str, Callable[[DisturbanceOnset], str]] = {
-        "errors of": lambda o: "one follower" if len(o.vehicles) == 2 else "all vehicles",
+        "errors of": errors_of,
         "disturbance": lambda o: o.kind,
         "radius, 1/s": lambda o: number_text(o.radius_1_s, ".5f"),
         "at, rad/s": lambda o: f"{o.frequency_rad_s:.2f}",
@@ -188,6 +194,8 @@ def print_disturbances(result: DisturbanceResult) -> None:
     title = f"disturbances that break {result.scenario} at {ms_text(result.loop_delay_s)} of loop delay"
     console.print(table_of(result.onsets, columns, title=title))
     console.print("dynamic: any stable filter, alpha is its radius; constant: a matrix, the same north and east")
+    for onset in (onset for onset in result.onsets if onset.missing):
+        console.print(f"onset    {errors_of(onset)}, {onset.kind}, not found: {onset.missing}")
     if result.failure:
         console.print(f"failed   {result.failure}")
 

@@ -263,6 +263,10 @@ def design(
     if method is not None:
         control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()} | NO_LAW)
         scenario = scenario.model_copy(update={"control": control})
+    if save is not None:
+        options.out_file("--save", save)
+        if save.exists():
+            raise InputError(f"--save: {save}: read a file that exists, wanted a new one")
     if sum((front, at is not None, links_of is not None)) > 1:
         raise InputError("read several of --front, --at and --links-of, wanted one of them")
     if front:
@@ -271,7 +275,6 @@ def design(
     scenario = scenario if at is None else fronts.scenario_at(scenario, at, maximise, predict)
     scenario, measured = chosen_for(scenario, links_of)
     if save is not None:
-        options.out_file("--save", save)
         save.write_text(dump(scenario), encoding="utf-8")
     result, plan = flight_plan(scenario, measured)
     if compare_prediction:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from gcs.stress.axes import Axis
     from gcs.stress.campaign import Fly
     from gcs.stress.report import CampaignResult
-    from gcs.stress.study import Onset, Study
-    from gcs.stress.trial import Outcome
+    from gcs.stress.study import NoOnset, Onset, Study
+    from gcs.stress.trial import Outcome, Run
 
 _AXIS = "FROM:TO:N"
 _OUT_WANTED = "a new or empty folder, or --resume"
@@ -40,9 +40,14 @@ def stress(
         list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="link delay of one vehicle; may be repeated")
     ] = None,
     jitter: Annotated[
-        str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
+        str,
+        typer.Option(
+            metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter, not for traces"
+        ),
     ] = "",
-    loss: Annotated[str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way")] = "",
+    loss: Annotated[
+        str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; in place of bursts, too")
+    ] = "",
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     prediction: Annotated[
         str,
@@ -99,8 +104,8 @@ def stress(
 
     Simulated autopilots fly in virtual time. Their response is identified first, and the margin takes it into account.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, or a trial flown again
-    differs.
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, no onset with
+    --disturbance was measured, or a trial flown again differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]
@@ -181,6 +186,9 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, seeds: int, *, s
         raise InputError(f"--seeds: read {seeds}, wanted it with an axis: a search draws its own seeds")
     if len(given) > 2:
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
+    vehicles = [text.partition("=")[0] for option, text in given if option == "--delay-of"]
+    if len(set(vehicles)) < len(vehicles):
+        raise InputError(f"--delay-of: read vehicle {vehicles[0]} twice, wanted two vehicles")
     if prediction and (len(given) != 2 or searches):
         raise InputError(f"--prediction: read {prediction}, wanted it with two other axes (a map) and no search")
 
@@ -303,7 +311,7 @@ def _campaign(
     from gcs.runs.record import SCENARIO_FILE, write_whole
     from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
-    from gcs.stress.study import NoOnset, find_onset
+    from gcs.stress.study import NoOnset
     from gcs.views.console import progress
     from scenarios.files import dump
     from scenarios.own_code import write_code
@@ -311,10 +319,10 @@ def _campaign(
     scenario = dump(study.plan.scenario)
     if resume:
         assert out is not None
-        check_study("--resume", out / TRIALS_FILE, scenario=scenario)
+        check_study("--resume", out / TRIALS_FILE, scenario=study.plan.scenario)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
-    onset_shorter: Onset | None = None
+    onset_shorter: Onset | NoOnset | None = None
     with raised(), contextlib.ExitStack() as stack:
         fly = stack.enter_context(workers)
         if out is None:
@@ -331,11 +339,10 @@ def _campaign(
                 sweep = run_campaign(trials, store, fly, ended=begin("flights"))
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
-                onset = find_onset(study, run, tolerance=tolerance, vehicle=vehicle)
-                if (study.window_s if vehicle is None else window_of(study.plan, vehicle))[0] > 0.0:
-                    onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
-        except NoOnset as reason:
-            onset = reason
+                onset = _onset_or_why(study, run, tolerance=tolerance, vehicle=vehicle)
+                begins_s, _ = study.window_s if vehicle is None else window_of(study.plan, vehicle)
+                if not isinstance(onset, NoOnset) and begins_s > 0.0:
+                    onset_shorter = _onset_or_why(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
         except KeyboardInterrupt:
             typer.echo(store.resume, err=True)
             raise
@@ -347,6 +354,17 @@ def _campaign(
     if why := write_report(folder, result, study=study, axes=axes):
         typer.echo(f"no figures: {why}", err=True)
     return result, folder
+
+
+def _onset_or_why(
+    study: "Study", run: "Run", *, tolerance: float, vehicle: int | None, shorter: bool = False
+) -> "Onset | NoOnset":
+    from gcs.stress.study import NoOnset, find_onset
+
+    try:
+        return find_onset(study, run, tolerance=tolerance, shorter=shorter, vehicle=vehicle)
+    except NoOnset as reason:
+        return reason
 
 
 def _duration_text(seconds: float) -> str:

@@ -90,7 +90,8 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     """The scenario at one point of a campaign.
 
     A rate sets the control rate, and the telemetry rate too if the two were equal; rates on board scale in proportion.
-    Jitter keeps the distribution of a link that has one; on other links it is uniform within ± the value.
+    Jitter keeps the distribution of a link that has one; on other links it is uniform within ± the value. Losses are
+    independent and replace bursts. Raises InputError for jitter in place of measured delays, which have no scale.
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
@@ -109,7 +110,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         change = partial(_with_jitter, scale_s=coordinates["jitter"])
         scenario = scenario.with_links(change, change)
     if "loss" in coordinates:
-        lossy = partial(Link.model_copy, update={"loss_probability": coordinates["loss"]})
+        lossy = partial(Link.model_copy, update={"loss_probability": coordinates["loss"], "loss_bursts": None})
         scenario = scenario.with_links(lossy, lossy)
     return scenario
 
@@ -155,9 +156,13 @@ def _with_rate(scenario: Scenario, hz: float) -> Scenario:
 
 
 def _with_jitter(link: Link, scale_s: float) -> Link:
+    if link.jitter is not None and link.jitter.distribution == "trace":
+        raise InputError(
+            "--jitter: read links with a trace of measured delays, wanted jitter that has a scale, or none"
+        )
     if scale_s == 0.0:
         return link.model_copy(update={"jitter": None})
-    if link.jitter is not None and link.jitter.scale_s is not None:
+    if link.jitter is not None:
         return link.model_copy(update={"jitter": link.jitter.model_copy(update={"scale_s": scale_s})})
     return link.model_copy(update={"jitter": Jitter(distribution="uniform", scale_s=scale_s)})
 

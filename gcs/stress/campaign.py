@@ -1,8 +1,8 @@
 """Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
 The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
-finished trial. A resumed campaign does not fly trials whose id is stored. `refly` flies one of them again, with files
-and a Rerun recording; in virtual time it repeats to the last bit.
+finished trial. A resumed campaign does not fly trials whose id is stored, unless they ended in an error. `refly` flies
+one of them again, with files and a Rerun recording; in virtual time it repeats to the last bit.
 """
 
 import contextlib
@@ -28,6 +28,10 @@ from gcs.runs.record import SCENARIO_FILE, RecordLog, write_parquet
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
+from scenarios.files import dump
+from scenarios.keys.own import CodeFile
+from scenarios.own_code import as_flown
+from scenarios.schema import Scenario
 
 TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"
@@ -85,8 +89,8 @@ def trials_of(folder: Path) -> Store[Outcome]:
     return Store(folder / TRIALS_FILE, Outcome, lambda outcome: outcome.id)
 
 
-def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | None = None) -> None:
-    """Check that a folder holds a study of this kind, and of this scenario if `scenario` (TOML) is given.
+def check_study(flag: str, file: Path, kind: str = "campaign", scenario: Scenario | None = None) -> None:
+    """Refuse a folder without the file of a kind of study, or with a study of another scenario or code.
 
     Raises InputError, which says what was read and what was wanted, if it does not.
     """
@@ -94,19 +98,23 @@ def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | N
         if not file.with_name(name).is_file():
             raise InputError(f"{flag}: read no {name} in {file.parent}, wanted the folder of a {kind}")
     known = file.with_name(SCENARIO_FILE)
-    if scenario is not None and known.read_text(encoding="utf-8") != scenario:
+    if scenario is not None and known.read_text(encoding="utf-8") != dump(scenario):
         raise InputError(f"{flag}: {file.parent} holds a {kind} of another scenario or loop, wanted {known}")
+    for code in () if scenario is None else as_flown(scenario).code:
+        kept = file.with_name(code.name)
+        if not kept.is_file() or CodeFile(name=code.name, text=kept.read_text(encoding="utf-8")).sha256 != code.sha256:
+            raise InputError(f"{flag}: {file.parent} holds a {kind} flown with other code, wanted {kept}")
 
 
 def run_campaign(
     trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] = lambda _: None
 ) -> list[Outcome]:
-    """Return the outcomes of trials in the given order; those not stored are flown, each once.
+    """Return the outcomes of trials in the given order; those not stored, or with an error, are flown, each once.
 
     `ended` is called after each trial with the number left. Raises KeyboardInterrupt also if Ctrl-C ended a flight in
     real time; that flight is not stored.
     """
-    missing = {trial.id: trial for trial in trials if trial.id not in store.flown}
+    missing = {t.id: t for t in trials if t.id not in store.flown or store.flown[t.id].error is not None}
     left = len(missing)
     try:
         for outcome in fly(list(missing.values())) if missing else ():

@@ -9,7 +9,7 @@ The flights are probes as in `gcs.stress.free_response`, but every vehicle has a
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import inf, pi
+from math import inf, isfinite, pi
 from typing import Literal
 
 import numpy as np
@@ -30,7 +30,8 @@ from scenarios.schema import Scenario
 Kind = Literal["dynamic", "constant"]
 KINDS: tuple[Kind, ...] = "dynamic", "constant"
 
-_ERROR_M = 5.0
+_AMPLITUDES = (5.0, 0.5, 0.05)
+"""Initial errors of a flight in m (m/s for the leader); the next is flown if errors leave the linear range."""
 _PILOT_S = 2.0
 _SIZES = (-1.0, 0.1, 1.0)
 """Sizes flown in a round, as distances from its middle in tolerances."""
@@ -49,10 +50,13 @@ class DisturbanceOnset(Published):
     radius_1_s: float
     frequency_rad_s: float
     onset_1_s: float | None
-    """None if growth did not pass zero in any flight."""
     error_1_s: float | None
     difference: float | None
     flights: int
+    measured: int
+    """The flights with a growth rate."""
+    missing: str = ""
+    """Why no onset was found, in one line; empty if one was."""
 
 
 class DisturbanceResult(Published):
@@ -111,23 +115,28 @@ def find_disturbance_onsets(
     radius, `tolerance` is half the range of sizes in a round, and `allowed` bounds the distance of an onset from the
     radius and its standard error. Calls `ended` after each flight. Raises InputError if the loop has no such radii.
     """
-    probe, delay_s = _probe(plan)
+    probes, delay_s = _probes(plan)
     onsets = tuple(
-        _onset(plan, probe, case, tolerance, ended) for case in cases(plan, delay_s, kinds=kinds, counts=counts)
+        _onset(plan, probes, case, tolerance, ended) for case in cases(plan, delay_s, kinds=kinds, counts=counts)
     )
     failure = None
-    if allowed is not None:
-        failure = missed(onsets, allowed)
+    if allowed is not None or all(onset.difference is None for onset in onsets):
+        failure = missed(onsets, inf if allowed is None else allowed)
     return DisturbanceResult(
         scenario=plan.scenario.name, loop_delay_s=delay_s, onsets=onsets, assert_onset=allowed, failure=failure
     )
 
 
 def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
-    """The number of onsets that are too far from the radius or too uncertain to tell; None if there are none."""
-    off = [o for o in onsets if o.difference is None or abs(o.difference) > allowed]
+    """How many onsets are not measured, too far from the radius, or not known well enough to tell; None if none is."""
+    unknown = [o for o in onsets if o.difference is None]
+    off = [o for o in onsets if o.difference is not None and abs(o.difference) > allowed]
     rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * o.radius_1_s]
-    reasons = (off, "farther than {} from the radius"), (rough, "known less well than to {} of the radius")
+    reasons = (
+        (unknown, "not measured"),
+        (off, "farther than {} from the radius"),
+        (rough, "known less well than to {} of the radius"),
+    )
     told = [f"{len(own)} of {len(onsets)} onsets are {why.format(f'{allowed:.3%}')}" for own, why in reasons if own]
     return "; ".join(told) or None
 
@@ -167,17 +176,18 @@ def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, co
     return found
 
 
-def _probe(plan: FlightPlan) -> tuple[Scenario, float]:
-    """The scenario to which the disturbance is added, and its loop delay (s)."""
+def _probes(plan: FlightPlan) -> tuple[list[Scenario], float]:
+    """The flights that the disturbance is added to, one for each amplitude, and their loop delay (s)."""
     ids = plan.formation.system_ids
     pilot = fly_plan(replace(plan, scenario=_calm(plan.scenario, _PILOT_S)))
     up, down = plan.scenario.link_of(ids[0])
     waiting_s = max(median_delays_s(first_uses(pilot.ticks), ids).values()) - up.delay_s - down.delay_s
-    probe = probe_scenario(
-        plan, ids, amplitude=_ERROR_M, links=(up, down), waiting_s=round(waiting_s, 6) % plan.timing.step_s
-    )
-    calm = fly_plan(replace(plan, scenario=_calm(probe, _PILOT_S)))
-    return probe, round(max(median_delays_s(first_uses(calm.ticks), ids).values()), 6)
+    waits_s = round(waiting_s, 6) % plan.timing.step_s
+    probes = [
+        probe_scenario(plan, ids, amplitude=amplitude, links=(up, down), waiting_s=waits_s) for amplitude in _AMPLITUDES
+    ]
+    calm = fly_plan(replace(plan, scenario=_calm(probes[0], _PILOT_S)))
+    return probes, round(max(median_delays_s(first_uses(calm.ticks), ids).values()), 6)
 
 
 def _calm(scenario: Scenario, duration_s: float) -> Scenario:
@@ -185,27 +195,43 @@ def _calm(scenario: Scenario, duration_s: float) -> Scenario:
 
 
 def _onset(
-    plan: FlightPlan, probe: Scenario, case: Case, tolerance: float, ended: Callable[[], None]
+    plan: FlightPlan, probes: Sequence[Scenario], case: Case, tolerance: float, ended: Callable[[], None]
 ) -> DisturbanceOnset:
     radius, omega = case.worst.radius_1_s, case.worst.frequency_rad_s
     turns_s = _TURNS * 2.0 * pi / omega if omega > 0.0 else 0.0
     duration_s = min(max(_SETTLED_S + turns_s, _SHORTEST_S), _LONGEST_S)
     points: list[GrowthPoint] = []
-    zero, middle, width = None, radius, tolerance * radius
+    sizes: list[float] = []
+    probe, *smaller = probes
+    zero, middle, width, linear = None, radius, tolerance * radius, True
     for _ in range(_ROUNDS if radius < inf else 0):
         for part in _SIZES:
             size = max(0.0, middle + part * width)
-            points += _flown(plan, case.scenario(probe, size, duration_s=duration_s), size)
-            ended()
+            while True:
+                measured, linear = _flown(plan, case.scenario(probe, size, duration_s=duration_s), size)
+                sizes.append(size)
+                ended()
+                if linear or not smaller:
+                    break
+                probe = smaller.pop(0)
+            points += measured
         zero = locate_zero([point for point in points if abs(point.varied - middle) <= 1.001 * width])
-        if zero is not None and zero.inside:
+        if not points or (zero is not None and zero.inside):
             break
         if zero is not None:  # move to where growth seems to pass zero, by three widths at most
             middle += float(np.clip(zero.varied - middle, -3.0 * width, 3.0 * width))
-        else:  # only the side is known: if growth is above zero everywhere, the onset is at a smaller size
-            middle += -2.0 * width if min((point.growth_1_s for point in points), default=0.0) > 0.0 else 2.0 * width
+        else:  # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
+            middle += -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
     inside = zero if zero is not None and zero.inside else None
     onset = None if inside is None else inside.varied
+    missing = ""
+    if not sizes:
+        missing = "no disturbance is predicted to break the formation"
+    elif not points:
+        far = "" if linear else f", which left the linear range: {_linear_range_text(probe)}"
+        missing = f"no growth rate in {len(sizes)} flights{far}"
+    elif onset is None:
+        missing = f"growth did not pass zero in {len(sizes)} flights with {min(sizes):.5f} to {max(sizes):.5f} 1/s"
     return DisturbanceOnset(
         kind=case.kind,
         vehicles=case.vehicles,
@@ -214,15 +240,25 @@ def _onset(
         onset_1_s=onset,
         error_1_s=None if inside is None else inside.error,
         difference=None if onset is None else onset / radius - 1.0,
-        flights=len(points),
+        flights=len(sizes),
+        measured=len(points),
+        missing=missing,
     )
 
 
-def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:
-    """Fly a disturbance of this size and measure the growth. Empty if it could not be measured."""
+def _linear_range_text(probe: Scenario) -> str:
+    return f"velocity errors up to {linear_error_m_s(probe):g} m/s, commands up to {LINEAR_COMMAND_M_S2:g} m/s²"
+
+
+def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> tuple[list[GrowthPoint], bool]:
+    """The growth measured in one flight with a disturbance of a size, and whether the flight stayed linear.
+
+    The first is empty if nothing was measured.
+    """
     flight, ids = fly_plan(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)
     until_s = linear_until_s(rows, linear_error_m_s(scenario), LINEAR_COMMAND_M_S2)
     growth = fit_growth(motion, start_s=_SETTLED_S, end_s=until_s, modes=_MODES)
-    return [] if growth is None else [GrowthPoint(size_1_s, growth.growth_1_s, growth.error_1_s)]
+    points = [] if growth is None else [GrowthPoint(size_1_s, growth.growth_1_s, growth.error_1_s)]
+    return points, not isfinite(until_s)

@@ -89,6 +89,8 @@ class CampaignResult(Published):
     onset: Onset | None
     onset_shorter: Onset | None = None
     """Where a loop that is predicted over a fixed delay breaks because the true delay is too short."""
+    onset_shorter_missing: str = ""
+    """Why that was not found, in one line."""
     response: ResponsePart | None = None
     """How the vehicles respond to set-points, which the margin takes into account; None if they respond at once."""
     onset_missing: str
@@ -116,7 +118,7 @@ def result_of(
     axes: Sequence[Axis],
     sweep: Sequence[Outcome],
     onset: Onset | NoOnset | None,
-    onset_shorter: Onset | None = None,
+    onset_shorter: Onset | NoOnset | None = None,
     allowed: float | None,
 ) -> CampaignResult:
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
@@ -128,13 +130,15 @@ def result_of(
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
+    onset_shorter, missing_shorter = (
+        (None, onset_shorter) if isinstance(onset_shorter, NoOnset) else (onset_shorter, None)
+    )
     failure = ""
     onsets = [each for each in (onset, onset_shorter) if each is not None]
     searched = [flight for each in onsets for flight in each.flights]
-    if allowed is not None and missing is not None and not missing.as_predicted:
-        failure = str(missing)
-    elif allowed is not None:
-        failure = "; ".join(filter(None, (_missed(each, allowed) for each in onsets)))
+    if allowed is not None:
+        unknown = (str(each) for each in (missing, missing_shorter) if each is not None and not each.as_predicted)
+        failure = "; ".join(filter(None, (*unknown, *(_missed(each, allowed) for each in onsets))))
     failure = "; ".join(filter(None, (failure, _nothing_measured(sweep))))
     return CampaignResult(
         scenario=study.plan.scenario.name,
@@ -148,6 +152,7 @@ def result_of(
         **({} if onset_shorter is None else {"onset_shorter": onset_shorter}),
         response=design.response,
         onset_missing=str(missing or ""),
+        onset_shorter_missing=str(missing_shorter or ""),
         onset_missing_as_predicted=missing is not None and missing.as_predicted,
         curve_error=curve_error([*(sweep if exact(study, axes) else ()), *searched]),
         assert_onset=allowed,

@@ -16,6 +16,7 @@ from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.growth import GrowthPoint, Zero, locate_zero
 from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, sparse_gain
+from scenarios.schema import Scenario
 
 _BRACKET_LINKS_S = (0.0, 0.05, 0.1, 0.2), (0.4, 0.8, 1.6)
 """Link delays (s), up plus down, flown to bracket where errors begin to grow: the second group if errors do not grow in
@@ -31,6 +32,7 @@ _LARGEST_ERROR = 0.1
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 _AT_ONCE = "the formation breaks without any link delay"
+_NONE_SHORT = "no link delay is short enough to break the formation"
 
 
 @dataclass(frozen=True)
@@ -82,10 +84,11 @@ class Onset:
     """Where the formation breaks, in flight and in the models.
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
-    down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design
-    or, with prediction, the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
-    `predicted_continuous_s` is the same for the continuous model, minus half a period for the hold. These are None if
-    there is no model, because the law is not linear or the dynamics are the user's own.
+    down, that causes this loop delay and is shorter by `waiting_s`, the median of the flights; `link_delay_range_s` is
+    that by their longest and their shortest wait, and `waits_for` says in words what they wait for. `predicted_s` is
+    the sampled margin of the design, or with prediction the end of its mismatch window. `difference` is `loop_delay_s`
+    / `predicted_s` − 1. `predicted_continuous_s` is the same for the continuous model, less half a period for the hold.
+    None where there is no model: of a law that is not linear, or of dynamics of one's own.
 
     `loop` lists the vehicles of the loop that breaks. `vehicle` is the one whose link alone was slowed: all delays are
     then its own, and `link_delay_left_s` is how much longer its link delay may be than in the scenario. Both are None
@@ -98,7 +101,9 @@ class Onset:
     predicted_continuous_s: float | None
     difference: float | None
     link_delay_s: float
+    link_delay_range_s: tuple[float, float]
     waiting_s: float
+    waits_for: str
     slope_1_s2: float
     frequency_rad_s: float | None
     probed: int
@@ -117,7 +122,7 @@ class Onset:
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
     """No delay breaks the formation, or none was found; the text is one line that says why.
 
-    `as_predicted` says that the margin has no limit and that the flights confirm it.
+    `as_predicted` says that the prediction has none either, and that the flights confirm it.
     """
 
     def __init__(self, line: str, *, as_predicted: bool = False) -> None:
@@ -199,17 +204,21 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
 
 def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:
-    """The finding that the wait for the control tick alone is longer than the loop delay of the onset."""
-    what = "no link delay is short enough to break the formation" if shorter else _AT_ONCE
+    """That waiting alone takes longer than the loop delay of the onset."""
+    what = _NONE_SHORT if shorter else _AT_ONCE
     at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
     return NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
 
 
 def _not_located(flights: Sequence[Outcome], scattered: Zero | None, *, shorter: bool) -> NoOnset:
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
-    flown = f"in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
+    count = f"{len(flights)} flight{'s' * (len(flights) != 1)}"
+    flown = f"in {count} with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
     if not shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) > 0.0 for own in flights):
         return NoOnset(f"{_AT_ONCE}: errors grow {flown}")
+    if shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) < 0.0 for own in flights):
+        expected = all((own.predicted_growth_1_s or 0.0) < 0.0 for own in flights)
+        return NoOnset(f"{_NONE_SHORT}: errors decay {flown}", as_predicted=expected)
     if scattered is not None:
         at = f"{scattered.varied:.3f} s ± {scattered.error:.3f} s of loop delay"
         return NoOnset(f"growth rates scatter too much {flown}: they pass zero at {at}")
@@ -274,9 +283,24 @@ def _median(known: Sequence[float]) -> float | None:
     return float(np.median(known)) if known else None
 
 
+def _waits_s(outcomes: Sequence[Outcome]) -> list[float]:
+    return [o.loop_delay_s - o.link_delay_s for o in outcomes if o.loop_delay_s and o.link_delay_s is not None] or [0.0]
+
+
 def _waiting_s(outcomes: Sequence[Outcome]) -> float:
-    waits = [o.loop_delay_s - o.link_delay_s for o in outcomes if o.loop_delay_s and o.link_delay_s is not None]
-    return _median(waits) or 0.0
+    return float(np.median(_waits_s(outcomes)))
+
+
+def _waits_for(scenario: Scenario, system_id: int) -> str:
+    """What the datagrams of a vehicle wait for, beside their link delay."""
+    links = scenario.link_of(system_id)
+    causes = {
+        "the queue of its channel": any(link.channel for link in links),
+        "jitter": any(link.jitter for link in links),
+        "lost datagrams": any(link.loss_probability or link.loss_bursts or link.corrupt_probability for link in links),
+    }
+    found = ", ".join(cause for cause, there in causes.items() if there)
+    return f"{found} and the control tick" if found else "the control tick"
 
 
 def _found(
@@ -319,6 +343,8 @@ def _found(
     beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
     own = run([study.trial("own", slowed.at(delay_s), seed=seed) for delay_s in beside_s])
     links = () if vehicle is None else study.plan.scenario.link_of(vehicle)
+    waits_s = _waits_s(near)
+    critical = nearest.critical if vehicle is None else vehicle
     return Onset(
         loop_delay_s=zero.varied,
         error_s=zero.error,
@@ -326,11 +352,13 @@ def _found(
         predicted_continuous_s=continuous_s,
         difference=None if np.isnan(predicted_s) else zero.varied / predicted_s - 1.0,
         link_delay_s=link_s,
+        link_delay_range_s=(max(0.0, zero.varied - max(waits_s)), max(0.0, zero.varied - min(waits_s))),
         waiting_s=waiting_s,
+        waits_for=_waits_for(study.plan.scenario, critical),
         slope_1_s2=zero.slope,
         frequency_rad_s=_median([o.frequency_rad_s for o in near if o.frequency_rad_s is not None]),
         probed=nearest.probed,
-        critical=nearest.critical if vehicle is None else vehicle,
+        critical=critical,
         rounds=rounds,
         flights=tuple(sorted(flights, key=lambda outcome: outcome.link_delay_s or 0.0)),
         checks=tuple(checks),

@@ -248,7 +248,7 @@ def loads_of(folder: Path, scenario: Scenario, *, resume: bool) -> Store[Load]:
     Raises InputError if `resume` is set and the folder holds no study of this scenario.
     """
     if resume:
-        check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))
+        check_study("--resume", folder / LOADS_FILE, "capacity study", scenario)
     write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
     return Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 

@@ -10,7 +10,7 @@ from gcs.stress.disturbance import find_disturbance_onsets
 from scenarios.files import load
 from scenarios.keys.autopilot import Response
 from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
-from scenarios.schema import Clocks, Scenario
+from scenarios.schema import Clocks, NominalVelocity, Scenario
 from scenarios.shipped import located
 
 AIR = Disturbance(wind_ne_m_s2=(0.2, -0.1), gusts=Gusts(deviation_m_s2=0.4, correlation_time_s=0.2))
@@ -74,6 +74,26 @@ def test_the_formation_breaks_at_its_stability_radius() -> None:
     [onset] = result.onsets
     assert onset.difference is not None
     assert abs(onset.difference) < 5e-3
+
+
+def test_a_slow_formation_is_disturbed_from_smaller_errors() -> None:
+    slow = {"nominal_velocity": (NominalVelocity(from_s=0.0, velocity_ne_m_s=(8.0, 0.0)),)}
+    pair = chain(vehicles=chain().vehicles[:2], **slow).with_link_delay(up_s=0.1, down_s=0.0844)
+    result = find_disturbance_onsets(flight_plan(pair)[1], tolerance=0.02, kinds=("constant",))
+    [onset] = result.onsets
+    assert (onset.missing, result.failure) == ("", None)
+    assert onset.difference == pytest.approx(0.0, abs=5e-3)
+    assert onset.flights == onset.measured + 1  # errors of 5 m leave the linear range
+
+
+def test_a_formation_too_slow_for_any_disturbance_says_so() -> None:
+    still = {"nominal_velocity": (NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.02, 0.0)),)}
+    pair = chain(vehicles=chain().vehicles[:2], **still).with_link_delay(up_s=0.1, down_s=0.0844)
+    result = find_disturbance_onsets(flight_plan(pair)[1], tolerance=0.02, kinds=("constant",))
+    assert result.failure == "1 of 1 onsets are not measured"
+    [onset] = result.onsets
+    assert (onset.measured, onset.difference) == (0, None)
+    assert onset.missing.startswith(f"no growth rate in {onset.flights} flights, which left the linear range")
 
 
 def test_flown_spread_of_copters_is_the_computed_one() -> None:

@@ -68,6 +68,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:N or a list"),
         (f"stress {CHAIN} --delay 0:600:3", "0.1,0.2, of at most 10000 values from 0 to 60 s"),
         (f"stress {CHAIN} --rate 0", "from 1 to 500 Hz"),
+        (f"stress {CHAIN} --delay-of 3=0.1,0.2 --delay-of 3=0.3,0.4", "--delay-of: read vehicle 3 twice, wanted two"),
         (
             f"stress {CHAIN} --onset --trial x --out README.md",
             "--out: read README.md, wanted the folder of a campaign,",
@@ -76,6 +77,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"fly {CHAIN} --virtual --out README.md", "--out: README.md: File exists, wanted a folder that can"),
         (f"fly {CHAIN} --virtual --out {{run}}", "run is not empty, wanted a new or empty folder"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
+        (f"design {CHAIN} --at 0.3 --save {{run}}/scenario.toml", "scenario.toml: read a file that exists, wanted a"),
     ],
 )
 def test_what_cannot_be_used_is_refused_before_the_work(

@@ -13,9 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from gcs.errors import InputError
+from gcs.runs.record import SCENARIO_FILE
 from gcs.stress.campaign import (
     PARQUET_FILE,
     TRIALS_FILE,
+    check_study,
     dask_workers,
     local_workers,
     run_campaign,
@@ -24,6 +26,9 @@ from gcs.stress.campaign import (
 )
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
+from scenarios.files import dump
+from scenarios.own_code import write_code
+from tests.support.fleets.own_code import LAW, coded
 from tests.support.fleets.stress_pair import trials
 from tests.support.paths import ROOT
 
@@ -81,6 +86,16 @@ def test_two_campaigns_do_not_fly_in_one_folder(tmp_path: Path) -> None:
     trials_of(tmp_path).close()
 
 
+def test_a_campaign_is_not_resumed_with_other_code(tmp_path: Path) -> None:
+    file, first = tmp_path / TRIALS_FILE, coded(law="soft")
+    (tmp_path / SCENARIO_FILE).write_text(dump(first))
+    write_code(first, tmp_path)
+    file.touch()
+    check_study("--resume", file, scenario=first)
+    with pytest.raises(InputError, match=r"--resume: .* holds a campaign flown with other code, wanted .*own\.py"):
+        check_study("--resume", file, scenario=coded(LAW.replace("-5.0", "-4.0"), law="soft"))
+
+
 def test_a_line_cut_short_costs_its_own_trial_only(tmp_path: Path) -> None:
     wanted, store = trials(3), trials_of(tmp_path)
     run_campaign(wanted, store, Here())
@@ -102,6 +117,19 @@ def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> N
     assert "IndexError" in (outcomes[1].error or "")
     assert outcomes[1].seed == 7
     assert left == [2, 1, 0]
+
+
+def test_a_resumed_campaign_flies_failed_trials_again(tmp_path: Path) -> None:
+    wanted, store = trials(2), trials_of(tmp_path)
+    store.add(replace(fly_trial(wanted[0]), error="MemoryError"))
+    store.add(fly_trial(wanted[1]))
+    store.close()
+    fly, store = Here(), trials_of(tmp_path)
+    outcomes = run_campaign(wanted, store, fly)
+    store.close()
+    assert fly.flown == [wanted[0].id]
+    assert [outcome.error for outcome in outcomes] == [None, None]
+    assert trials_of(tmp_path).flown[wanted[0].id].error is None
 
 
 def test_the_table_has_trials_as_rows_axes_as_columns(tmp_path: Path) -> None:

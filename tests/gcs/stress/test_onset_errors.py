@@ -23,8 +23,9 @@ def onset(difference: float, error: float) -> Onset:
     at_s = MARGIN_S * (1.0 + difference)
     return Onset(
         loop_delay_s=at_s, error_s=error * MARGIN_S, predicted_s=MARGIN_S, predicted_continuous_s=None,
-        difference=difference, link_delay_s=at_s - 0.01, waiting_s=0.01, slope_1_s2=1.0, frequency_rad_s=None, probed=2,
-        critical=2, rounds=1, flights=(), checks=(), vehicle=None, link_delay_left_s=None, loop=(2,), own=(),
+        difference=difference, link_delay_s=at_s - 0.01, link_delay_range_s=(at_s - 0.01, at_s - 0.01), waiting_s=0.01,
+        waits_for="the control tick", slope_1_s2=1.0, frequency_rad_s=None, probed=2, critical=2, rounds=1, flights=(),
+        checks=(), vehicle=None, link_delay_left_s=None, loop=(2,), own=(),
     )  # fmt: skip
 
 
@@ -49,15 +50,17 @@ def test_an_onset_is_asserted_no_finer_than_it_is_known(difference: float, error
 
 
 def test_a_disturbance_is_asserted_no_finer_than_it_is_known() -> None:
-    def found(error: float, difference: float = 0.0) -> DisturbanceOnset:
+    def found(error: float, difference: float | None = 0.0) -> DisturbanceOnset:
         return DisturbanceOnset(
-            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0, onset_1_s=2.0 * (1.0 + difference),
-            error_1_s=2.0 * error, difference=difference, flights=3,
+            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0,
+            onset_1_s=None if difference is None else 2.0 * (1.0 + difference),
+            error_1_s=2.0 * error, difference=difference, flights=3, measured=3,
         )  # fmt: skip
 
     assert missed([found(0.04), found(0.04)], 0.05) is None
     assert missed([found(0.06), found(0.04)], 0.05) == "1 of 2 onsets are known less well than to 5.000% of the radius"
     assert missed([found(0.0, 0.06)], 0.05) == "1 of 1 onsets are farther than 5.000% from the radius"
+    assert missed([found(0.0, None), found(0.0)], 0.05) == "1 of 2 onsets are not measured"
 
 
 @pytest.mark.parametrize(
@@ -69,7 +72,20 @@ def test_a_disturbance_is_asserted_no_finer_than_it_is_known() -> None:
 )
 def test_an_onset_that_waiting_exceeds_is_not_a_link_delay(waiting_s: float, spread_s: float, said: str) -> None:
     """Flights whose growth is zero at 0.27 s, and that wait longer than that: always, or in the mean."""
-    block_s = 0.27
+    with pytest.raises(NoOnset, match=said):
+        search_among_waits(waiting_s, spread_s, block_s=0.27)
+
+
+def test_a_link_delay_is_known_no_finer_than_the_waits() -> None:
+    found = search_among_waits(0.15, 0.1, block_s=0.6)
+    least_s, most_s = found.link_delay_range_s
+    assert (least_s, most_s) == pytest.approx((0.35, 0.55), abs=2e-3)
+    assert least_s < found.link_delay_s < most_s
+    assert found.waits_for == "lost datagrams and the control tick"
+
+
+def search_among_waits(waiting_s: float, spread_s: float, *, block_s: float) -> Onset:
+    """The onset among flights over lossy links whose growth is zero at `block_s` and whose waits differ."""
 
     def fly(trial: Trial) -> Outcome:
         link_s = dict(trial.coordinates)["delay"]
@@ -81,8 +97,7 @@ def test_an_onset_that_waiting_exceeds_is_not_a_link_delay(waiting_s: float, spr
 
     lossy = SCENARIO.model_copy(update={"links": Links(up=Link(loss_probability=0.1))})
     study = replace(STUDY, plan=replace(STUDY.plan, scenario=lossy, delay_margin_s=block_s))
-    with pytest.raises(NoOnset, match=said):
-        find_onset(study, lambda trials: [fly(trial) for trial in trials], tolerance=0.05)
+    return find_onset(study, lambda trials: [fly(trial) for trial in trials], tolerance=0.05)
 
 
 def aborted(trial: Trial) -> Outcome:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from gcs.errors import InputError
 from gcs.stress.axes import at_coordinates, has_constant_links, parse_axis, split_delay
-from scenarios.keys.link import Jitter, Link
+from scenarios.keys.link import Jitter, Link, LossBursts
 from tests.support.fleets.stress_pair import SCENARIO
 
 
@@ -55,6 +55,20 @@ def test_jitter_keeps_the_distribution_that_a_link_has() -> None:
     up, down = at_coordinates(own, {"jitter": 0.02}).link_of(1)
     assert up.jitter == Jitter(distribution="gamma", scale_s=0.02, shape=3.0)
     assert down.jitter == Jitter(distribution="uniform", scale_s=0.02)
+
+
+def test_jitter_does_not_replace_measured_delays() -> None:
+    traced = Link(jitter=Jitter(distribution="trace", trace_s=(0.01, 0.2)))
+    own = SCENARIO.model_copy(update={"links": SCENARIO.links.model_copy(update={"up": traced})})
+    with pytest.raises(InputError, match="--jitter: read links with a trace of measured delays, wanted jitter with"):
+        at_coordinates(own, {"jitter": 0.02})
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_loss_takes_the_place_of_bursts(loss: float) -> None:
+    bursty = Link(loss_bursts=LossBursts(to_bad_probability=0.02, to_good_probability=0.5))
+    own = SCENARIO.model_copy(update={"links": SCENARIO.links.model_copy(update={"up": bursty, "down": bursty})})
+    assert at_coordinates(own, {"loss": loss}).link_of(1) == (Link(loss_probability=loss),) * 2
 
 
 def test_a_slower_telemetry_rate_of_its_own_stays() -> None:
