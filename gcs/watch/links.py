@@ -253,8 +253,6 @@ class Watch:
             return None
         if frame.msg_id == mavlink.HEARTBEAT:
             remote.heartbeat(frame.fields, time_ns)
-        elif frame.msg_id == mavlink.NAMED_VALUE_INT:
-            remote.named_int(frame.fields)
         elif frame.msg_id in _POSITIONS:
             vehicle.state(frame, time_ns)
         elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:

@@ -243,6 +243,8 @@ class _Rebuilding:
             key_ms = (asked_ns - base_ns) // 1_000_000 if self._outline.keys else 0
             delivery_ns = vehicle.remote.delivery_ns(key_ms, base_ns + key_ms * 1_000_000)
             self._fleet.loop.delivered(row, delivery_ns or 0, asked_ns)
+        if frame.msg_id == mavlink.NAMED_VALUE_INT:
+            vehicle.remote.named_int(frame.fields, (time_ns - self._outline.base_ns) // 1_000_000, time_ns)
         if frame.msg_id != mavlink.LOCAL_POSITION_NED:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
