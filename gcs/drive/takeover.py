@@ -138,5 +138,5 @@ def _scenario_of(frame: mavlink.Frame) -> str:
     """A vehicle's answer about its experiment: fingerprint and name of the scenario."""
     if frame.msg_id != mavlink.PARAM_EXT_VALUE:
         return ""
-    name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in frame.fields[2:4])
+    name, value = map(mavlink.text_of, frame.fields[2:4])
     return value if name == _SCENARIO else ""

@@ -101,6 +101,12 @@ def named_fields(frame: Frame) -> dict[str, Any]:
     return named
 
 
+def text_of(field: bytes) -> str:
+    """The text in a field up to its first NUL. What is not printable is replaced: a terminal would obey it."""
+    text = field.partition(b"\0")[0].decode(errors="replace")
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
+
+
 def target_system(frame: Frame) -> int:
     """The system that a frame is addressed to; 0 for all."""
     place = _TARGET_PLACES.get(frame.msg_id)

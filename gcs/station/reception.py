@@ -246,7 +246,7 @@ class Reception:
                 possible = vehicle.named_int(fields, (received_ns - self._start_ns) // 1_000_000, received_ns)
                 self.counters.update([] if possible else ["impossible LAG_MS"])
             case mavlink.STATUSTEXT:
-                text = fields[1].split(b"\0")[0].decode(errors="replace")
+                text = mavlink.text_of(fields[1])
                 if vehicle.startup.is_news(text):
                     self._report("statustext", text, vehicle.system_id)
             case _:

@@ -113,7 +113,7 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
 
 def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
     """What a STATUSTEXT of the station says about a vehicle: its mode, or the number of its gain set."""
-    found = _ANNOUNCED.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
+    found = _ANNOUNCED.match(mavlink.text_of(frame.fields[1]))
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 

@@ -190,3 +190,13 @@ def test_a_lag_counts_only_where_it_is_possible(holds: bool, held_s: float, refu
     assert station.counters["impossible LAG_MS"] == refused
     expected_s = held_s if holds and not refused else 0.0
     assert station.vehicles[1].delivery_ns(key_ms, sent_ns) == pytest.approx(expected_s * 1e9, abs=MS)
+
+
+def test_texts_of_vehicles_cannot_move_the_cursor() -> None:
+    """Nor clear the screen, nor begin a line of their own."""
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    texts = [b"\x1b[2J\x1b[31mred", b"one\nvehicle 2: LOST\r\x07", b"\xc2\x9b2J", "Höhe 5 m".encode()]
+    said = [peer.datagram(peer.link.statustext_encode(2, text), S) for text in texts]
+    station.step([peer.heartbeat(S), *said], S)
+    told = [event.text for event in station.events if event.kind == "statustext"]
+    assert told == ["�[2J�[31mred", "one�vehicle 2: LOST��", "�2J", "Höhe 5 m"]
