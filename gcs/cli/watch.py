@@ -115,8 +115,7 @@ def monitor(
         console.print(render(report, width=console.width))
     if save_links is not None and recorder is not None:
         _save(save_links, recorder, f"gcs monitor at {listen}", shown=not as_json)
-    bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
-    raise typer.Exit(INTERRUPTED if interrupted else FAILED if bad or not report.vehicles else 0)
+    raise typer.Exit(INTERRUPTED if interrupted else FAILED if report.failed else 0)
 
 
 def replay(

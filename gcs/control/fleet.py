@@ -64,6 +64,7 @@ class Fleet:
                 report=report,
                 land=scenario.at_end == "land",
                 external=system_id == scenario.external_id,
+                holds=scenario.control.execute_at,
                 links=self.links,
                 row=row,
             )

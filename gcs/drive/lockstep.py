@@ -122,6 +122,7 @@ def prepare(plan: FlightPlan) -> None:
         outbox, _ = station.step([], station.next_event_ns)
         station.sent(outbox, np.zeros(len(outbox), np.int64))
     station.vehicles[0].frames.restart()  # as after a long silence
+    station.vehicles[0].delivery_ns(0, 0)  # as when it reports how long it holds set-points
 
 
 def fly_lockstep(

@@ -103,6 +103,12 @@ def named_fields(frame: Frame) -> dict[str, Any]:
     return named
 
 
+def text_of(field: bytes) -> str:
+    """The text in a field up to its first NUL. What is not printable is replaced: a terminal would obey it."""
+    text = field.partition(b"\0")[0].decode(errors="replace")
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
+
+
 def target_system(frame: Frame) -> int:
     """The system that a frame is addressed to; 0 for all."""
     place = _TARGET_PLACES.get(frame.msg_id)
@@ -253,7 +259,7 @@ def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
 def scenario_of(fields: tuple[Any, ...]) -> str:
     """The fingerprint and name of a simulated vehicle's scenario, from the fields of PARAM_EXT_VALUE; "" if of another
     parameter."""
-    name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in fields[2:4])
+    name, value = map(text_of, fields[2:4])
     return value if name == SCENARIO else ""
 
 

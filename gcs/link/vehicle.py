@@ -44,6 +44,8 @@ from scenarios.schema import NS_PER_S
 ARMED = 0x80
 _MOST_NAMED = 10
 STATE_CRITICAL = 5
+_LONGEST_HOLD_NS = 5 * NS_PER_S
+"""A vehicle that holds set-points starts anew if their arrival changes by more than this."""
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
 _NOBODY = -1
@@ -221,10 +223,13 @@ class RemoteVehicle:
         report: Report = ignored,
         land: bool = False,
         external: bool = False,
+        holds: bool = False,
         links: Links | None = None,
         row: int = 0,
     ) -> None:
         self.system_id, self.wire_id = system_id, wire_id(system_id)
+        self._holds = holds
+        """Whether it holds set-points, so that its `LAG_MS` counts."""
         self.external = external
         """Whether it is planned that somebody else flies it. It takes part in the formation and its mode does not
         matter; the station only requests messages from it."""
@@ -385,11 +390,21 @@ class RemoteVehicle:
         """Report that its frames arrive LATE or DUPLICATE."""
         self._report("link", _ORDER_TEXT[order], self.system_id)
 
-    def named_int(self, fields: tuple[Any, ...]) -> None:
-        """Process a NAMED_VALUE_INT: it may report the lag after which the vehicle's held set-points act."""
+    def named_int(self, fields: tuple[Any, ...], key_ms: int, now_ns: int) -> bool:
+        """Process a NAMED_VALUE_INT: it may report the lag after which the vehicle's held set-points act.
+
+        The lag includes the clock offset. Returns False for an impossible one: a set-point stamped now would be held
+        too long.
+        """
         _, value, name = fields
-        if name.rstrip(b"\0") == b"LAG_MS":
-            self._lag_ms, self._lag_jumps = value, self.clock.jumps
+        if not self._holds or name.rstrip(b"\0") != b"LAG_MS":
+            return True
+        before = self._lag_ms, self._lag_jumps
+        self._lag_ms, self._lag_jumps = value, self.clock.jumps
+        possible = (self.delivery_ns(key_ms, now_ns) or 0) - (self.clock.down_ns or 0) <= _LONGEST_HOLD_NS
+        if not possible:
+            self._lag_ms, self._lag_jumps = before
+        return possible
 
     def delivery_ns(self, key_ms: int, sent_ns: int) -> int | None:
         """Time from `sent_ns` until the set-point with this stamp acts; None while unknown."""

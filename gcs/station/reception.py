@@ -243,9 +243,10 @@ class Reception:
             case mavlink.COMMAND_ACK:
                 vehicle.acknowledge(fields, received_ns)
             case mavlink.NAMED_VALUE_INT:
-                vehicle.named_int(fields)
+                possible = vehicle.named_int(fields, (received_ns - self._start_ns) // 1_000_000, received_ns)
+                self.counters.update([] if possible else ["impossible LAG_MS"])
             case mavlink.STATUSTEXT:
-                text = fields[1].split(b"\0")[0].decode(errors="replace")
+                text = mavlink.text_of(fields[1])
                 if vehicle.startup.is_news(text):
                     self._report("statustext", text, vehicle.system_id)
             case _:

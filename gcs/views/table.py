@@ -37,6 +37,7 @@ from gcs.views.console import (
     vehicles_text,
 )
 from gcs.views.scene import Newest
+from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import Scenario
 
 WINDOW_S = 5.0
@@ -100,9 +101,12 @@ class FlightState:
         """Delay margin of the fastest gains."""
 
     def at_delay(self, figures: "Figures") -> str:
-        """In words, α and the growth of spacing errors at the largest median loop delay, rounded to the millisecond."""
+        """In words, α and the growth of spacing errors at the largest median loop delay, rounded to the millisecond.
+
+        Empty for delays longer than any loop is designed for.
+        """
         delay_s = _worst(figures.loop_delay_s_p50)
-        if np.isnan(delay_s):
+        if not delay_s <= PREDICTION_MAX_S:
             return ""
         key = round(1e3 * delay_s), figures.gain_set
         if key not in self._at_delay:

@@ -107,7 +107,7 @@ def _watch_virtually(found: _Measurement, scenario: Scenario) -> None:
         for system_id, data, time_ns in vehicles.step(to_vehicles, now_ns):
             network = network_of(system_id)
             for frame in mavlink.in_network(mavlink.decode(data, found.watch.counters), network):
-                found.watch.take(frame, time_ns, ("virtual", system_id, network))
-                found.recorder.note(frame, time_ns)
+                if found.watch.take(frame, time_ns, ("virtual", system_id, network)) is not None:
+                    found.recorder.note(frame, time_ns)
         to_vehicles = [(system_id, data, now_ns) for data, (_, system_id, _) in requests.due(found.watch, now_ns)]
         now_ns = requests.next_ns

@@ -30,6 +30,7 @@ from gcs.link.vehicle import RemoteVehicle
 from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
+from gcs.station.reception import ANOTHER_ADDRESS
 from scenarios.schema import NS_PER_S, Rates
 
 if TYPE_CHECKING:
@@ -40,7 +41,8 @@ SYSTEM_ID = 254
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
-"""Mean time between two looks."""
+"""Mean time between two looks, each of which records the age of the newest states."""
+PAST = "past the margin"
 LOWER_BOUND = "lower bound"
 """Status of a delay measured against the fastest frame for lack of an exchange."""
 _GOLDEN = 0.6180339887498949
@@ -89,6 +91,12 @@ class WatchReport(Published):
     scenario_telemetry_hz: float | None = None
     """None without a scenario."""
 
+    @property
+    def failed(self) -> bool:
+        """Whether a vehicle was never heard or a loop delay exceeded the margin, whatever the vehicle does now."""
+        bad = any(v.status in ("not heard", PAST) or (v.headroom or 0.0) < 0.0 for v in self.vehicles)
+        return bad or not self.vehicles
+
 
 class WatchedVehicle:
     """One vehicle as seen by a passive observer: what it sent, and how late that arrived."""
@@ -123,7 +131,7 @@ class WatchedVehicle:
         boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
         if frame.msg_id != self._kind or (self.states and boot_ns == self.boot_ns):
             return
-        if boot_ns < self.boot_ns < boot_ns + NS_PER_S:
+        if boot_ns < self.boot_ns < boot_ns + NS_PER_S and not self.remote.newest:
             return  # overtaken by a newer state
         self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # detects a clock jump
         if boot_ns < self.boot_ns:
@@ -162,6 +170,8 @@ class WatchedVehicle:
                 sampled_ns = clock.estimate.to_station_ns(self.boot_ns)
                 down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
             age_s = (now_ns - sampled_ns) * 1e-9
+            if clock.samples and clock.exchange_due:  # the state is of a clock that may have started anew
+                age_s = down_s = nan
         self.age_s.append(age_s)
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s, repeated_s))
 
@@ -203,7 +213,7 @@ class WatchedVehicle:
         if now_ns - self.remote.heard_ns > SILENT_NS:
             return "silent"
         if left is not None and left < 0:
-            return "past the margin"
+            return PAST
         if not self.remote.clock.samples:
             return "no exchange"
         return "no position" if loop_delay_s is None else "measured"
@@ -245,16 +255,17 @@ class Watch:
                 self._note_request(frame.fields[1], time_ns)
             return None
         remote = vehicle.remote
-        remote.heard_ns, remote.address = time_ns, address
         if frame.component_id != _AUTOPILOT:
             self.counters["other component"] += 1
             return None
+        if address is not None and remote.is_elsewhere(address, time_ns):
+            self.counters[ANOTHER_ADDRESS] += 1
+            return None
+        remote.heard_ns, remote.address = time_ns, address
         if remote.is_replay(frame, time_ns):
             return None
         if frame.msg_id == mavlink.HEARTBEAT:
             remote.heartbeat(frame.fields, time_ns)
-        elif frame.msg_id == mavlink.NAMED_VALUE_INT:
-            remote.named_int(frame.fields)
         elif frame.msg_id in _POSITIONS:
             vehicle.state(frame, time_ns)
         elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:

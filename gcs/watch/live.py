@@ -73,8 +73,8 @@ def watch_links(
             for datagram in link.receive(watch.counters):
                 frames = mavlink.decode_either(datagram.data, watch.counters)
                 for frame in mavlink.in_network(frames, datagram.address[2]):
-                    watch.take(frame, datagram.received_ns, datagram.address)
-                    if recorder is not None:
+                    taken = watch.take(frame, datagram.received_ns, datagram.address)
+                    if recorder is not None and taken is not None:
                         recorder.note(frame, datagram.received_ns)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)

@@ -112,8 +112,8 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
 
 
 def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
-    """The vehicle that a STATUSTEXT of the station is about, and its mode or the number of its gain set."""
-    found = _ANNOUNCED.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
+    """What a STATUSTEXT of the station says about a vehicle: its mode, or the number of its gain set."""
+    found = _ANNOUNCED.match(mavlink.text_of(frame.fields[1]))
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
@@ -242,6 +242,8 @@ class _Rebuilding:
             key_ms = (asked_ns - base_ns) // 1_000_000 if self._outline.keys else 0
             delivery_ns = vehicle.remote.delivery_ns(key_ms, base_ns + key_ms * 1_000_000)
             self._fleet.loop.delivered(row, delivery_ns or 0, asked_ns)
+        if frame.msg_id == mavlink.NAMED_VALUE_INT:
+            vehicle.remote.named_int(frame.fields, (time_ns - self._outline.base_ns) // 1_000_000, time_ns)
         if frame.msg_id != mavlink.LOCAL_POSITION_NED:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields

@@ -122,7 +122,7 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
         return broken
     left = sorted({vehicle.system_id for vehicle in scenario.vehicles} - set(last["system_id"].tolist()))
     if left:
-        return f"lost: vehicles {', '.join(map(str, left))} are sent nothing at the end"
+        return f"vehicles {', '.join(map(str, left))} are sent nothing at the end"  # lost, or flown by their pilots
     end_s = float(last["time_s"][0])
     if end_s < scenario.duration_s - 1.5 / scenario.rates.control_hz:
         return f"interrupted: set-points end after {end_s:.1f} s of {scenario.duration_s:g} s"

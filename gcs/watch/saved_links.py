@@ -43,7 +43,10 @@ class _OneVehicle:
 
 
 class LinkRecorder:
-    """Keeps each vehicle's delays and losses from the frames that a `Watch` has taken in."""
+    """Keeps each vehicle's delays and losses from the frames that a `Watch` has taken in.
+
+    Cameras and gimbals share the id of a vehicle but number their frames apart.
+    """
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -108,8 +111,8 @@ def recorded(frames: Iterable[tuple[int, mavlink.Frame]]) -> LinkRecorder:
     watch = Watch()
     recorder = LinkRecorder(watch)
     for time_ns, frame in frames:
-        watch.take(frame, time_ns)
-        recorder.note(frame, time_ns)
+        if watch.take(frame, time_ns) is not None:
+            recorder.note(frame, time_ns)
     return recorder
 
 

@@ -9,9 +9,9 @@ from rich.text import Text
 
 from gcs.views.console import UNKNOWN, FittedColumn, fitted_table, ms_text, not_shown, number_text
 from gcs.views.table import headroom_text
-from gcs.watch.links import LOWER_BOUND, LinkFigures, WatchReport
+from gcs.watch.links import LOWER_BOUND, PAST, LinkFigures, WatchReport
 
-STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
+STATUS_STYLES = {"measured": "green", PAST: "bold red", "silent": "bold red", "not heard": "bold red"}
 NOT_ASKED = "many autopilots send none until a station asks; --request asks"
 RATES_UNKNOWN = "no scenario, so no rates: repetition of a position counts as loop delay"
 _SLOW = 0.9

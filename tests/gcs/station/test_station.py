@@ -170,3 +170,33 @@ def test_ticks_that_were_slept_through_are_left_out_and_counted() -> None:
         assert tick is not None
         ticks.append((tick.number, tick.due_ns))
     assert ticks == [(0, S), (1, S + 20 * MS), (2, S + 40 * MS), (5, S + 100 * MS)]
+
+
+@pytest.mark.parametrize(("holds", "held_s", "refused"), [(False, 60.0, 0), (True, 60.0, 1), (True, 0.1, 0)])
+def test_a_lag_counts_only_where_it_is_possible(holds: bool, held_s: float, refused: int) -> None:
+    """A Lua script may send a NAMED_VALUE_INT of the same name."""
+    control = SCENARIO.control.model_copy(update={"execute_at": holds})
+    scenario = SCENARIO.model_copy(update={"control": control})
+    station, peer = Station(replace(PLAN, scenario=scenario), start_ns=S), Peer(2)
+    booted_ns, said = S - 7 * S, [peer.heartbeat(S)]
+    for now_ns in range(S, 2 * S, MS):  # over links without delay
+        outgoing, _ = station.step(said, now_ns)
+        asked = [request.ts1 for request in messages(outgoing, "TIMESYNC")]
+        said = [peer.datagram(peer.link.timesync_encode(now_ns - booted_ns, ts1), now_ns) for ts1 in asked]
+    sent_ns, key_ms = 2 * S, 1000
+    lag_ms = (sent_ns - booted_ns) // MS - key_ms + round(1000 * held_s)
+    named = peer.link.named_value_int_encode(lag_ms, b"LAG_MS", lag_ms)
+    station.step([peer.datagram(named, sent_ns)], sent_ns)
+    assert station.counters["impossible LAG_MS"] == refused
+    expected_s = held_s if holds and not refused else 0.0
+    assert station.vehicles[1].delivery_ns(key_ms, sent_ns) == pytest.approx(expected_s * 1e9, abs=MS)
+
+
+def test_texts_of_vehicles_cannot_move_the_cursor() -> None:
+    """Nor clear the screen, nor begin a line of their own."""
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    texts = [b"\x1b[2J\x1b[31mred", b"one\nvehicle 2: LOST\r\x07", b"\xc2\x9b2J", "Höhe 5 m".encode()]
+    said = [peer.datagram(peer.link.statustext_encode(2, text), S) for text in texts]
+    station.step([peer.heartbeat(S), *said], S)
+    told = [event.text for event in station.events if event.kind == "statustext"]
+    assert told == ["�[2J�[31mred", "one�vehicle 2: LOST��", "�2J", "Höhe 5 m"]

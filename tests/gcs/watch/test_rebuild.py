@@ -172,6 +172,21 @@ def test_another_tools_log_gives_links_and_errors_but_no_verdict(requests: bool)
             assert np.median(np.abs(found[axis] - at_the_same_time)) < 0.01
 
 
+def test_a_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
+    """Its pilot may fly it: the log does not say."""
+    scenario = scenario_of("chain3")
+    design, _, _, entries = flown(scenario)
+    last_ns, kept = entries[-1][0], list[tuple[int, bytes]]()
+    for time_ns, data in entries:
+        own = [mavlink.target_system(frame) for frame in mavlink.decode(data, Counter())]
+        if time_ns < last_ns - 2_000_000_000 or own != [3]:
+            kept.append((time_ns, data))
+    source = LogSource(Path("flight.tlog"), scenario, design, None)
+    rebuilt = rebuild_report(parse_tlog(log_bytes(kept)), source).flight
+    assert rebuilt is not None
+    assert (rebuilt.verdict, rebuilt.reason) == ("aborted", "vehicles 3 are sent nothing at the end")
+
+
 def test_without_a_scenario_the_links_are_all_that_is_told() -> None:
     data, _ = overheard(requests=True)
     result = rebuild_report(parse_tlog(data), LogSource(Path("other.tlog"), None, None, None))

@@ -1,17 +1,22 @@
 """Links measured, then flown: a profile saved from a flight leads to the same loop delay."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from gcs.cli.main import app
+from gcs.link import mavlink
 from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE
+from gcs.watch.saved_links import recorded
 from scenarios.errors import ScenarioError
 from scenarios.files import load, with_profile
 from scenarios.link_files import load_profile
 from scenarios.shipped import FOLDER, PROFILES, names
+
+MS = 1_000_000
 
 
 def run(*arguments: str) -> str:
@@ -62,3 +67,26 @@ def test_unknown_profile_is_one_line(tmp_path: Path) -> None:
     file.write_text(text.split("[links]")[0] + '[links]\nprofile = "nope"\n', encoding="utf-8")
     with pytest.raises(ScenarioError, match=r"links\.profile.*one of lte, radio, satellite, wifi"):
         load(file)
+
+
+def test_a_camera_with_the_vehicles_id_loses_no_frames() -> None:
+    """It numbers its frames apart."""
+    begin_ns = 1_000_000_000
+    said: list[tuple[int, int, int, int, int, tuple[object, ...]]] = [
+        (begin_ns, 1, 1, 0, mavlink.HEARTBEAT, (0, 2, 3, 0, 4, 3))
+    ]
+    for k in range(100):
+        ns = begin_ns + 50 * MS * k
+        said += [
+            (ns, 255, 190, k, mavlink.TIMESYNC, (0, ns)),
+            (ns + 10 * MS, 1, 1, 2 * k + 1, mavlink.TIMESYNC, (ns + 5 * MS, ns)),
+            (ns + 20 * MS, 1, 1, 2 * k + 2, mavlink.LOCAL_POSITION_NED, (ns // MS + 15, *(0.0,) * 6)),
+            (ns + 30 * MS, 1, 100, 77 + k, mavlink.HEARTBEAT, (0, 30, 8, 0, 4, 3)),
+        ]
+    frames: list[tuple[int, mavlink.Frame]] = []
+    for time_ns, system_id, component_id, sequence, msg_id, fields in said:
+        [frame] = mavlink.decode(mavlink.encode(msg_id, fields, sequence=sequence, system_id=system_id), Counter())
+        frames.append((time_ns, frame._replace(component_id=component_id)))
+    measured = recorded(frames).profile("here").measured
+    assert measured is not None
+    assert (measured.up.datagrams > 100, measured.up.lost) == (True, 0)

@@ -13,7 +13,7 @@ from rich.console import Console
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
 from gcs.plan.design import Design, OwnMargins
-from gcs.watch.links import SYSTEM_ID, Requests, Watch, WatchReport
+from gcs.watch.links import SYSTEM_ID, LinkFigures, Requests, Watch, WatchReport
 from gcs.watch.table import NOT_ASKED, RATES_UNKNOWN, links_table, render
 from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links
@@ -85,6 +85,28 @@ class Watched:
         boot_ms = self.watch.vehicles[1].boot_ns // MS
         sampled = [row[3] for row in self.truth.records.tolist() if row[:3] == (SAMPLED, 1, boot_ms)]
         return (self.now_ns - sampled[-1]) * 1e-9 if sampled else np.nan
+
+
+class Peer:
+    """A vehicle that says what a test wants."""
+
+    def __init__(self, system_id: int, port: int = 1) -> None:
+        self._system_id, self._address, self._sequence = system_id, (HOST, port, 0), 0
+
+    def say(
+        self, watch: Watch, msg_id: int, fields: tuple[object, ...], time_ns: int, *, component_id: int = 1
+    ) -> None:
+        self._sequence += 1
+        data = mavlink.encode(msg_id, fields, sequence=self._sequence, system_id=self._system_id)
+        [frame] = mavlink.decode(data, Counter())
+        watch.take(frame._replace(component_id=component_id), time_ns, self._address)
+
+
+def report_of(vehicles: list[LinkFigures]) -> WatchReport:
+    return WatchReport(
+        listening="", duration_s=8.0, delay_margin_s=0.3, margin_of="", silent=False, send_errors=0, stations=(),
+        sent={"TIMESYNC": 1}, refused={}, vehicles=tuple(vehicles),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("late_ns", [0, MS // 2])
@@ -304,3 +326,52 @@ def test_slow_positions_are_told_with_what_they_do(
     Console(file=text, width=80).print(render(report, width=80))
     told = [line for line in text.getvalue().splitlines() if "position" in line]
     assert told == ([said] if said else [])
+
+
+@pytest.mark.parametrize(("delay_s", "failed"), [(0.2, True), (0.01, False)])
+def test_delays_past_the_margin_fail_although_the_vehicle_is_silent_now(delay_s: float, failed: bool) -> None:
+    watched = Watched(linked(Link(delay_s=delay_s), Link(delay_s=delay_s)), timesync_hz=10.0)
+    watched.run(5.0)
+    figures = watched.watch.figures(watched.now_ns + 4_000 * MS, Design(delay_margin_s=0.3))
+    assert {vehicle.status for vehicle in figures} == {"silent"}
+    assert report_of(figures).failed == failed
+
+
+def test_a_camera_is_not_its_vehicle() -> None:
+    watch, peer = Watch([2]), Peer(2)
+    peer.say(watch, mavlink.HEARTBEAT, (0, 30, 8, 0, 4, 3), START_NS, component_id=100)
+    figures = watch.figures(START_NS, None)
+    assert [vehicle.status for vehicle in figures] == ["not heard"]
+    assert report_of(figures).failed
+    assert not Requests(10.0, 10.0).due(watch, START_NS)
+
+
+@pytest.mark.parametrize("by_s", [0.5, 60.0])
+@pytest.mark.parametrize("asks", [False, True])
+def test_a_clock_set_back_shows_in_no_delay(asks: bool, by_s: float) -> None:
+    """States at 20 Hz and exchanges at 2 Hz, over links without delay."""
+    watch, peer, now_ns, by_ns = Watch([1]), Peer(1), 0, round(by_s * 1e9)
+    for tick in range(400):
+        now_ns = 100 * START_NS + 50 * MS * tick
+        boot_ns = 100_000 * MS + now_ns - (by_ns if tick >= 201 else 0)
+        peer.say(watch, mavlink.LOCAL_POSITION_NED, (boot_ns // MS, *(0.0,) * 6), now_ns)
+        watch.look(now_ns + MS)
+        if asks and tick % 10 == 0:
+            peer.say(watch, mavlink.TIMESYNC, (boot_ns, watch.ask(now_ns)), now_ns)
+        watch.look(now_ns + 45 * MS)
+    [figures] = watch.figures(now_ns + 46 * MS, None)
+    assert known(figures.loop_delay_s.max) < 0.05
+    assert figures.loop_delay_s.samples > 150
+
+
+def test_a_second_vehicle_with_the_same_id_is_counted_apart() -> None:
+    watch, peers, now_ns = Watch([1]), [Peer(1, port=1), Peer(1, port=2)], 0
+    for tick in range(100):
+        for k, peer in enumerate(peers):
+            now_ns = START_NS + 50 * MS * tick + k
+            boot_ms = (now_ns + k * 30_000 * MS) // MS
+            peer.say(watch, mavlink.LOCAL_POSITION_NED, (boot_ms, *(0.0,) * 6), now_ns)
+    [figures] = watch.figures(now_ns, None)
+    assert figures.telemetry_hz == pytest.approx(20.0)
+    assert (figures.received, figures.late) == (100, 0)
+    assert watch.counters == {"known system id from another address": 100}
