@@ -95,6 +95,7 @@ def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargi
     """
     from gains.sampled.onboard import own_part
     from gcs.cli.options import load_scenario
+    from gcs.plan.own_law import OWN_DYNAMICS
     from gcs.plan.planner import flight_plan
 
     scenario = load_scenario(file, allow_code=allow_code)
@@ -102,9 +103,13 @@ def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargi
         wanted = "double_integrator: gcs design and gcs fly give the margin with an autopilot's response"
         raise ModelFileError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
     design, plan = flight_plan(scenario)
-    if design.margin_unknown or scenario.response is not None:
-        wanted = design.margin_unknown or "gcs design, which gives the margin with a response"
-        raise ModelFileError(f"{file}: read code without a linear model of its loop, wanted {wanted}")
+    if scenario.response is not None:
+        raise ModelFileError(f"{file}: read a [response], wanted none: gcs design gives the margin with it")
+    if design.margin_unknown:
+        read = "code" if scenario.code else f"dynamics {scenario.dynamics!r}"
+        way = "a [response], as gcs identify prints it, for gcs design; or gcs stress --onset"
+        wanted = way if design.margin_unknown == OWN_DYNAMICS else design.margin_unknown
+        raise ModelFileError(f"{file}: read {read} without a linear model of its loop, wanted {wanted}")
     model, loop = plan.model, plan.scenario.control.loop
     at_once = own_part(model, plan.gain) if loop == "onboard" else np.zeros_like(plan.gain)
     terms = Term(model.A + model.B @ at_once, 0.0, Fraction(0)), Term(model.B @ (plan.gain - at_once), 0.0, Fraction(1))

@@ -291,6 +291,12 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
     return mirror
 
 
+def refuse_alone(option: str, value: object, needed: str, *given: object) -> None:
+    """Refuse an option that was given without any of those that it needs; None was not given."""
+    if value is not None and all(other is None for other in given):
+        raise InputError(f"read {option} without {needed}, wanted it with {needed}")
+
+
 def refuse_headroom(least: float | None) -> None:
     if least is not None:
         within("--assert-headroom", least, -1e3, 1.0)

@@ -95,7 +95,7 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     files = sorted(file.name for file in folder.iterdir() if file.is_file())
     console.print(f"files    {folder}: {', '.join(files)}")
     if result.worst:
-        console.print(f"again    {refly_command(folder, result.worst[0])}")
+        console.print(f"again    {refly_command(folder, result)}")
     if result.failure:
         console.print(Text.assemble(("failed", "bold red"), f"   {result.failure}"))
 

@@ -263,6 +263,9 @@ def design(
     if method is not None:
         control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()} | NO_LAW)
         scenario = scenario.model_copy(update={"control": control})
+    options.refuse_alone("--save", save, "--at or --links-of", at, links_of)
+    options.refuse_alone("--predict", predict, "--at", at)
+    options.refuse_alone("--picture", picture, "--front", front or None)
     if save is not None:
         options.out_file("--save", save)
         if save.exists():

@@ -122,6 +122,7 @@ def bench(
     given = [name for name, on in (("--peers", peers), ("--cluster", cluster), ("--real-time", real_time)) if on]
     if len(given) > 1:
         raise InputError(f"read {' and '.join(given)}, wanted one of them")
+    options.refuse_alone("--workers", workers or None, "--cluster", cluster or None)
     scenario = options.load_scenario(scenario_file, allow_code=allow_code)
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)

@@ -157,9 +157,7 @@ def _with_rate(scenario: Scenario, hz: float) -> Scenario:
 
 def _with_jitter(link: Link, scale_s: float) -> Link:
     if link.jitter is not None and link.jitter.distribution == "trace":
-        raise InputError(
-            "--jitter: read links with a trace of measured delays, wanted jitter that has a scale, or none"
-        )
+        raise InputError("--jitter: read links with a trace of measured delays, wanted jitter with a scale, or none")
     if scale_s == 0.0:
         return link.model_copy(update={"jitter": None})
     if link.jitter is not None:

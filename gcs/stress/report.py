@@ -22,6 +22,7 @@ from gcs.stress.figures import worst_of
 from gcs.stress.study import NoOnset, Onset, Study, curve_error
 from gcs.stress.trial import Outcome
 from gcs.views.page import data_uri, rendered
+from scenarios.own_code import ALLOW
 
 REPORT_FILE = "report.html"
 _TEMPLATE = "stress_report.html.j2"
@@ -269,12 +270,14 @@ def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Se
         random=not exact(study, axes),
         coupled=any(len(loop.system_ids) > 1 for loop in plan_loops(study.plan)),
         gains=_gains(result.gains),
-        again=refly_command(folder, result.worst[0]) if result.worst else "",
+        again=refly_command(folder, result) if result.worst else "",
     )
     (folder / REPORT_FILE).write_text(page, encoding="utf-8")
     return not_drawn
 
 
-def refly_command(folder: Path, trial_id: str) -> str:
-    """The command that flies a trial of a campaign again."""
-    return shlex.join(["gcs", "stress", str(folder / "scenario.toml"), "--out", str(folder), "--trial", trial_id])
+def refly_command(folder: Path, result: CampaignResult) -> str:
+    """The command that flies the worst trial of a campaign again."""
+    allowed = [ALLOW] if result.gains.code else []
+    scenario = str(folder / "scenario.toml")
+    return shlex.join(["gcs", "stress", scenario, *allowed, "--out", str(folder), "--trial", result.worst[0]])

@@ -96,6 +96,16 @@ def test_margins_that_nobody_computed_cannot_be_asserted(
     assert NOT_LINEAR in capsys.readouterr().err
 
 
+def test_a_campaign_says_how_to_fly_its_code_again(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = "stress pair.toml --delay 0.1 --workers 1 --allow-code --out map"
+    assert code_of(monkeypatch, *arguments.split()) == 0
+    [again] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("again ")]
+    assert code_of(monkeypatch, *again.split()[2:]) == 0
+    assert "identical to the last bit" in capsys.readouterr().out
+
+
 def test_a_run_keeps_its_code_and_flies_again_from_its_folder(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -77,6 +77,10 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"fly {CHAIN} --virtual --out README.md", "--out: README.md: File exists, wanted a folder that can"),
         (f"fly {CHAIN} --virtual --out {{run}}", "run is not empty, wanted a new or empty folder"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
+        (f"bench {CHAIN} --workers 3", "read --workers without --cluster, wanted it with --cluster"),
+        (f"design {CHAIN} --save {{run}}/new.toml", "read --save without --at or --links-of, wanted it with --at or"),
+        (f"design {CHAIN} --predict on", "read --predict without --at, wanted it with --at"),
+        (f"design {CHAIN} --picture {{run}}/front.svg", "read --picture without --front, wanted it with --front"),
         (f"design {CHAIN} --at 0.3 --save {{run}}/scenario.toml", "scenario.toml: read a file that exists, wanted a"),
     ],
 )

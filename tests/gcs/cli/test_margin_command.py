@@ -271,6 +271,14 @@ def test_a_scenario_whose_vehicles_answer_late_is_refused() -> None:
         margin_of_scenario(SCENARIOS / "copters5.toml")
 
 
+def test_an_aircraft_without_response_is_told_where_its_margin_is(tmp_path: Path) -> None:
+    file, text = tmp_path / "aircraft.toml", (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
+    file.write_text(text.replace("seed = 1", 'seed = 1\ndynamics = "jsbsim"', 1), encoding="utf-8")
+    wanted = r"wanted a \[response\], as gcs identify prints it, for gcs design; or gcs stress --onset"
+    with pytest.raises(ModelFileError, match=f"read dynamics 'jsbsim' without a linear model of its loop, {wanted}"):
+        margin_of_scenario(file)
+
+
 def test_matlab_file_is_read_as_its_json_would_be(tmp_path: Path) -> None:
     held = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "K": [[-1.0, -1.5]], "hold": True, "period": 0.02}
     savemat(tmp_path / "held.mat", held)
