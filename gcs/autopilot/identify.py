@@ -108,6 +108,10 @@ class Flown:
     velocity_m_s: FloatArray
     """In the direction of the manoeuvre. Its mean, such as a drift, is ignored."""
 
+    @property
+    def has_too_few_samples(self) -> bool:
+        return self.sample_s.size < _FEWEST_SAMPLES or self.command_m_s2.size < 2
+
     def velocities(self, responses: list[Response]) -> FloatArray:
         """The modelled velocity at each sample, for each of k responses of one model, shape (k, n).
 
@@ -145,7 +149,7 @@ def identify(flown: Flown) -> Generator[None, None, Identified | None]:
 
     None if there are too few samples, or no motion.
     """
-    if flown.sample_s.size < _FEWEST_SAMPLES or flown.command_m_s2.size < 2:
+    if flown.has_too_few_samples:
         return None
     size = float(np.sqrt(np.square(flown.velocity_m_s - flown.velocity_m_s.mean()).mean()))
     if not size > 0.0:

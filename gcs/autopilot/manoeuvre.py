@@ -119,8 +119,14 @@ class Identification:
 
     def _why_not(self, row: int, seen: Identified | None) -> str:
         way_on = "a [response] in the scenario replaces the manoeuvre"
+        flown = self._flown(row)
+        if seen is None and not flown.has_too_few_samples:
+            return (
+                f"reported the same velocity throughout a manoeuvre of {self._amplitude_m_s2:.2g} m/s^2; see that it "
+                f"can move and that its LOCAL_POSITION_NED holds its velocity; {way_on}"
+            )
         if seen is None:
-            rate_hz, asked_hz = len(self._samples[row]) / identify.LONGEST_S, self._plan.scenario.rates.telemetry_hz
+            rate_hz, asked_hz = flown.sample_s.size / identify.LONGEST_S, self._plan.scenario.rates.telemetry_hz
             return (
                 f"sent too little telemetry: {rate_hz:.1f} states a second in the manoeuvre, wanted "
                 f"{identify.LEAST_RATE_HZ:g}; raise rates.telemetry_hz (now {asked_hz:g}) or what the link carries; "

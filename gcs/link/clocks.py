@@ -56,6 +56,10 @@ LATEST_NS = 1 << 62
 REQUEST_LIFETIME_NS = 20_000_000_000
 MOST_PENDING = 4096
 """Maximum number of unanswered requests remembered: 20 s at 200 Hz."""
+UNANSWERED, UNANSWERED_NS = 10, 2_000_000_000
+"""A vehicle that leaves this many requests in a row unanswered, over this time and three round trips, does not answer.
+With 30 % of the datagrams lost each way, at 10 Hz, chance does it once in 40 hours: 1 / (q p^20) requests, q = 0.7^2,
+p = 1 - q."""
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Maximum rate difference of two clocks; an offset that changes faster has jumped."""
@@ -101,6 +105,7 @@ CLOCK = np.dtype(
         ("stamp_error_ns", "f8"),  # largest stamp error that contradictions between exchanges have shown
         ("lost", "?"),  # known to have jumped, but not yet by how much
         ("asked_ns", "i8"),  # when the last request was sent
+        ("unanswered", "i8"), ("waits_ns", "i8"),  # requests since the newest answered one; when the first was sent
         ("doubtful_state", "?"),
         ("newest_boot_ns", "i8"),  # boot time of the newest accepted state since the last jump
         ("count", "i8"),  # exchanges since the last jump
@@ -226,6 +231,8 @@ def _joined(own: Limits, other: Limits, tighter: bool) -> Limits:
 def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
     """Record a request sent now; returns its ts1, unique among the pending requests."""
     clock.asked_ns = now_ns
+    clock.waits_ns = clock.waits_ns if clock.unanswered else now_ns
+    clock.unanswered += 1
     while _place(clock, pending_ns, now_ns) >= 0:
         now_ns += 1
     if clock.pending == len(pending_ns):
@@ -235,6 +242,13 @@ def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
     if now_ns - pending_ns[0, 0] > REQUEST_LIFETIME_NS:
         _drop(clock, pending_ns, 0)
     return now_ns
+
+
+@kernel
+def answers(clock: Record, now_ns: int) -> bool:
+    """Whether it still answers requests. If it does not, its link down may be slower than known, or dead."""
+    waited_ns = now_ns - clock.waits_ns
+    return clock.unanswered < UNANSWERED or waited_ns <= UNANSWERED_NS + 3 * clock.rtt_ns
 
 
 @kernel
@@ -323,6 +337,8 @@ def reply(
         clock.unmatched += 1
         return UNKNOWN
     _drop(clock, pending_ns, place)
+    clock.unanswered = clock.pending - place
+    clock.waits_ns = pending_ns[place, 1] if clock.unanswered else 0
     rtt = received_ns - sent_ns
     clock.rtt_ns = rtt
     if sent_ns < clock.since_ns:
@@ -582,6 +598,7 @@ class VehicleClock:
     samples = Cell[int]()
     """Exchanges behind the estimate; 0 while the clock is unknown."""
     jumps, unmatched, expected_error_ns = Cell[int](), Cell[int](), Cell[int]()
+    unanswered = Cell[int]()
     rtt_ns, down_ns = Cell[int | None](UNKNOWN), Cell[int | None](UNKNOWN)
     down_bound_ns, loop_bound_ns, stamp_error_ns = Cell[float](), Cell[float](), Cell[float]()
 

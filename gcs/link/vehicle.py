@@ -14,6 +14,7 @@ from gcs.link.clocks import (
     UNKNOWN,
     Clocks,
     VehicleClock,
+    answers,
     boot_ns_of,
     estimate_of,
     new_clocks,
@@ -149,6 +150,8 @@ def ask(
         row = turn % len(known)
         if known[row].address == _NOBODY:
             continue
+        if now_ns - known[row].heard_ns > SILENCE_S * NS_PER_S:
+            clocks[row].unanswered = 0  # it says nothing at all: that is silence
         rows[place] = row
         known[row].sequence = (known[row].sequence + 1) & 0xFF
         ts1_ns = request(clocks[row], pending_ns[row], now_ns)
@@ -162,8 +165,10 @@ def delivery_ns(link: Record, clock: Record, key_ms: int, sent_ns: int) -> int:
     """Time from `sent_ns` until the set-point with the stamp `key_ms` acts: the delay down, or longer if it is held.
 
     A held set-point acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is
-    unknown. The result is UNKNOWN while the delay down is.
+    unknown. The result is UNKNOWN while the delay down is, or if the vehicle no longer answers.
     """
+    if not answers(clock, sent_ns):
+        return UNKNOWN
     if clock.down_ns == UNKNOWN or not key_ms or link.lag_jumps != clock.jumps or not clock.samples:
         return clock.down_ns
     known = estimate_of(clock)

@@ -139,7 +139,8 @@ def judge(scenario: Scenario, ticks: TickArray, events: Sequence[Event]) -> Judg
     late = chosen(flown, flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)))
     headroom_end = min(_medians(late, "headroom").values(), default=None)
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
-    found = verdict(reason, settled, headroom_end=headroom_end, logged=logged)
+    known = all(np.isfinite(own["loop_delay_s"]).mean() >= 0.5 for own in by_vehicle(late).values() if own.size)
+    found = verdict(reason, settled, headroom_end=headroom_end, known=logged and known)
     return Judgement(found, reason, settled, headroom_end, not_logged, flown, flown_of, errors)
 
 
@@ -200,7 +201,7 @@ def _medians(rows: TickArray, name: str) -> dict[int, float]:
 
 
 def verdict(
-    reason: str, settling_time_s: float | None, *, headroom_end: float | None = None, logged: bool = True
+    reason: str, settling_time_s: float | None, *, headroom_end: float | None = None, known: bool = True
 ) -> str:
     """ "stable", "unstable", "aborted" or "unknown".
 
@@ -208,13 +209,13 @@ def verdict(
     end. Unstable: a limit was broken; or a spacing error had not settled, because it grows, circles in a limit cycle or
     shrinks too slowly; or errors were small but the loop delay was past the margin at the end, where errors grow slowly
     or limits hold them in a small cycle. Aborted: ended early for any other reason. Unknown: flown to the end, but the
-    log of ticks is incomplete.
+    log of ticks is incomplete, or the loop delay of a vehicle was unknown for most of the last quarter.
     """
     if reason.startswith("broken"):
         return "unstable"
     if not reason.startswith("completed"):
         return "aborted"
-    if not logged:
+    if not known:
         return "unknown"
     return "unstable" if settling_time_s is None or (headroom_end or 0.0) < 0.0 else "stable"
 

@@ -79,8 +79,9 @@ def policy_of(monitor: Monitor) -> Policy:
 def next_state(state: Record, seen: Observation, margins_s: Array, policy: Policy) -> None:
     """Advance a vehicle's state, a record of STATE, by one tick. `margins_s` are the margins of its gain sets.
 
-    h is the headroom of the set flown, h+ that of the next faster set. "For hold" and "for ease" mean that the
-    condition has lasted `policy.hold_s` or `policy.ease_s`. The first matching row applies:
+    h is the headroom of the set flown, h+ that of the next faster set. An unknown h, as of a vehicle that no longer
+    answers TIMESYNC, counts as below critical but not as below 0. "For hold" and "for ease" mean that the condition has
+    lasted `policy.hold_s` or `policy.ease_s`. The first matching row applies:
 
     ==================  ====================================================  ============================
     from                when                                                  to
@@ -120,7 +121,7 @@ def next_state(state: Record, seen: Observation, margins_s: Array, policy: Polic
         state.mode = _NOMINAL
     else:
         own = _headroom(seen.loop_delay_s, margins_s[state.gain_set])
-        if not is_at_ease(state) or own < policy.caution_headroom:
+        if not is_at_ease(state) or not own >= policy.caution_headroom:
             # a released vehicle returns to the slowest set
             faster = own if state.released else _headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
             _by_headroom(state, own, faster, slowest, policy, seen.time_s)
@@ -130,7 +131,8 @@ def next_state(state: Record, seen: Observation, margins_s: Array, policy: Polic
 def _by_headroom(state: Record, own: float, faster: float, slowest: int, policy: Policy, now_s: float) -> None:
     """The rows of the table that depend on headroom; `own` is h, and `faster` is h+."""
     last_resort = state.gain_set == slowest and state.mode == _CRITICAL and not state.released
-    state.pressed_s = _since(state.pressed_s, own < (0.0 if last_resort else policy.critical_headroom), now_s)
+    pressed = own < 0.0 if last_resort else not own >= policy.critical_headroom
+    state.pressed_s = _since(state.pressed_s, pressed, now_s)
     state.eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
     blending = now_s < state.changed_s + policy.blend_s
     if not blending and now_s - state.pressed_s >= policy.hold_s and not state.released:

@@ -5,7 +5,8 @@ avoid jumps in the commands.
 
 As headroom shrinks, the monitor acts in this order:
 
-1. CRITICAL: the vehicle's gains change to the next slower set of the schedule, which has a larger margin.
+1. CRITICAL: the vehicle's gains change to the next slower set of the schedule, which has a larger margin. So they do
+   if headroom is unknown.
 2. Still CRITICAL on the slowest set: the whole formation opens to `open_factor` times its spacing.
 3. No headroom on the slowest set: vehicles are released to their failsafe, those farthest down the tree first.
 
@@ -138,18 +139,16 @@ def _is_calm(
     state: Record, seen: Seen, row: int, delays_s: Array, seen_ticks: int, separable: bool, largest_s: float,
     margins_s: Array, policy: Policy,
 ) -> bool:  # fmt: skip
-    """Whether a vehicle is heard, guided and at ease, with enough or unknown headroom: true at most ticks."""
+    """Whether a vehicle is heard, guided and at ease, with enough headroom: true at most ticks."""
     if seen.silent[row] or not seen.guided[row] or not is_at_ease(state):
         return False
     margin_s, caution = margins_s[state.gain_set], policy.caution_headroom
     if not separable:
-        return isnan(largest_s) or _headroom(largest_s, margin_s) >= caution
-    known = enough = 0
+        return _headroom(largest_s, margin_s) >= caution
+    enough = 0
     for place in range(seen_ticks):
-        known += not isnan(delays_s[row, place])
         enough += _headroom(delays_s[row, place], margin_s) >= caution
-    rank = _rank(seen_ticks)
-    return not (known > rank and enough <= rank)
+    return enough > _rank(seen_ticks)
 
 
 @kernel
@@ -262,11 +261,18 @@ class FormationMonitor:
         return int(critical.nonzero()[0].max(initial=-1))
 
     def _open(self, time_s: float, *, flying: bool) -> None:
-        """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
+        """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it.
+
+        A CRITICAL vehicle whose headroom is unknown does not open it: its loop may be well, and its gains are slow.
+        """
         slowest = self.margins_s.shape[1] - 1
         settled_s = time_s - self.policy.blend_s  # gives the slowest gains time to take effect
         changed_s = self._states["changed_s"]
-        late = any(self.gain_sets[row] == slowest and changed_s[row] < settled_s for row in self._troubled)
+        newest_s = self._delays_s[:, (self._judged[0] - 1) % self._delays_s.shape[1]]
+        unknown = (self.modes == Mode.CRITICAL) & np.isnan(newest_s)
+        late = any(
+            self.gain_sets[row] == slowest and changed_s[row] < settled_s and not unknown[row] for row in self._troubled
+        )
         goal = self._keys.open_factor if late and self._keys.act and flying else 1.0
         step = (self._keys.open_factor - 1.0) * self._period_s / self._keys.open_s
         self.opening += min(step, max(-step, goal - self.opening))

@@ -19,6 +19,7 @@ from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
+from gcs.link.clocks import UNANSWERED
 from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, note_requests, set_points_to
@@ -391,8 +392,7 @@ class Station:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
                 self._busy.add(row)
             if after.mode is not before.mode:
-                self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
-                self._tell(vehicle, after.mode, after.mode.name, outgoing)
+                self._change_mode(vehicle, before.mode, after.mode, outgoing)
             if after.released != before.released and flying:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)
@@ -467,6 +467,13 @@ class Station:
         self._report("phase", str(phase))
 
     # -- sending and reporting -------------------------------------------------------------------------------------
+
+    def _change_mode(self, vehicle: RemoteVehicle, before: Mode, after: Mode, outgoing: Outbox) -> None:
+        """Report a change of mode; the vehicle may be CRITICAL because its headroom is unknown."""
+        self._report("mode", f"{before.name} -> {after.name}", vehicle.system_id)
+        self._tell(vehicle, after, after.name, outgoing)
+        if after is Mode.CRITICAL and vehicle.clock.unanswered >= UNANSWERED:
+            self._report("vehicle", "does not answer TIMESYNC: its loop delay is unknown", vehicle.system_id)
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""

@@ -23,6 +23,7 @@ import numpy as np
 
 from gcs.control.loop_delay import headroom, loop_delay_s, repeated_since_s
 from gcs.link import mavlink
+from gcs.link.clocks import UNANSWERED, UNANSWERED_NS
 from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
@@ -105,6 +106,8 @@ class WatchedVehicle:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
         self.remote.goal = None  # it is not to be brought into any state
         self.rtt_s = array("d")
+        self._exchanged_ns = 0, 0
+        """When the first and the newest reply came."""
         self.age_s = array("d")
         self.loop_delay_s = array("d")
         """Ages and loop delays, one for each look; NaN where unknown and during a silence, which is not a latency."""
@@ -154,6 +157,17 @@ class WatchedVehicle:
         """Least reception time minus boot time among recent frames: the least delay minus the clock offset."""
         return min(self._least_ns)
 
+    def reply(self, rtt_ns: int, received_ns: int) -> None:
+        """Take in the round trip of an exchange."""
+        self.rtt_s.append(rtt_ns * 1e-9)
+        self._exchanged_ns = self._exchanged_ns[0] or received_ns, received_ns
+
+    def exchanges(self, now_ns: int) -> bool:
+        """Whether replies come: there was one in the time of the usual `UNANSWERED` of them."""
+        (first_ns, newest_ns), count = self._exchanged_ns, len(self.rtt_s)
+        usual_ns = UNANSWERED * (newest_ns - first_ns) // max(1, count - 1)
+        return count > 0 and now_ns - newest_ns <= max(UNANSWERED_NS, usual_ns) + 3 * (self.remote.clock.rtt_ns or 0)
+
     def look(self, now_ns: int, *, asked: bool = True) -> None:
         """Sample the age of the newest state, and the loop delay of a command computed from it now.
 
@@ -168,7 +182,7 @@ class WatchedVehicle:
             sampled_ns = self.boot_ns + self.least_delay_ns
             if clock.samples:
                 sampled_ns = clock.estimate.to_station_ns(self.boot_ns)
-                down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+                down_s = clock.down_ns * 1e-9 if clock.down_ns is not None and self.exchanges(now_ns) else nan
             age_s = (now_ns - sampled_ns) * 1e-9
             if clock.samples and clock.exchange_due:  # the state is of a clock that may have started anew
                 age_s = down_s = nan
@@ -214,7 +228,7 @@ class WatchedVehicle:
             return "silent"
         if left is not None and left < 0:
             return PAST
-        if not self.remote.clock.samples:
+        if not self.remote.clock.samples or not self.exchanges(now_ns):
             return "no exchange"
         return "no position" if loop_delay_s is None else "measured"
 
@@ -313,7 +327,7 @@ class Watch:
         clock = vehicle.remote.clock
         rtt_ns = clock.reply(tc1_ns=tc1_ns, ts1_ns=clock.request(asked_ns), received_ns=received_ns)
         if rtt_ns is not None:
-            vehicle.rtt_s.append(rtt_ns * 1e-9)
+            vehicle.reply(rtt_ns, received_ns)
 
 
 def prepare() -> None:

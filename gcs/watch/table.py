@@ -87,7 +87,7 @@ def _bound(figures: LinkFigures) -> str:
 
 def _without_position(report: WatchReport) -> list[Text]:
     """A note about vehicles that send no position, if there are any: an ArduPilot streams none unless it is asked."""
-    without = [str(v.system_id) for v in report.vehicles if v.loop_delay_s.p50 is None and v.received]
+    without = [str(v.system_id) for v in report.vehicles if v.telemetry_age_s.p50 is None and v.received]
     if not without:
         return []
     why = "asked for, but not sent yet" if report.sent.get("SET_MESSAGE_INTERVAL") else NOT_ASKED

@@ -5,6 +5,7 @@ default.
 """
 
 import os
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
@@ -16,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from gcs.control.tick import Event, Mode, TickArray
 from gcs.drive.flown import fly_plan
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.link import mavlink
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
@@ -142,6 +144,47 @@ def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
     assert len(told) >= len(changes) - len(plan.formation.system_ids)
     assert {m.severity for m in told if m.text.endswith("CRITICAL")} == {dialect.MAV_SEVERITY_CRITICAL}
     assert {m.severity for m in told if m.text.endswith("CAUTION")} == {dialect.MAV_SEVERITY_WARNING}
+
+
+@dataclass
+class Unanswering:
+    """Vehicles one of whose TIMESYNC replies are lost: all from a time on, or a share of them."""
+
+    vehicles: Vehicles
+    system_id: int
+    share: float
+    from_ns: int
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(1))
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        return [
+            (system_id, data, time_ns)
+            for system_id, data, time_ns in self.vehicles.step(received, now_ns)
+            if system_id != self.system_id
+            or time_ns < self.from_ns
+            or {frame.msg_id for frame in mavlink.decode(data, Counter())} != {mavlink.TIMESYNC}
+            or self.rng.random() >= self.share
+        ]
+
+
+@pytest.mark.parametrize(("share", "tells"), [(1.0, True), (0.3, False)])
+def test_a_vehicle_that_answers_no_timesync_is_critical(share: float, tells: bool) -> None:
+    """Its loop delay may be any. Lost replies are no sign of it."""
+    plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 40.0}))
+    station = Station(plan, start_ns=START_NS)
+    vehicles = Unanswering(vehicles_of(plan.scenario), 5, share, START_NS + 12_000_000_000)
+    ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=vehicles)))
+    told = [e for e in station.events if e.text == "does not answer TIMESYNC: its loop delay is unknown"]
+    assert [e.system_id for e in told] == ([5] if tells else [])
+    late = ticks[(ticks["system_id"] == 5) & (ticks["time_s"] > 15.0) & ticks["commanded"]]
+    assert set(late["mode"]) == {Mode.CRITICAL if tells else Mode.NOMINAL}
+    assert np.isnan(late["headroom"]).all() == tells
+    others = ticks[(ticks["system_id"] != 5) & (ticks["time_s"] > 15.0) & ticks["commanded"]]
+    assert set(others["mode"]) == {Mode.NOMINAL}
+    events = [*station.events, Event(time_s=0.0, kind="end", text=station.end_reason)]
+    assert summarise(plan.scenario, Design(delay_margin_s=0.3), ticks, events).verdict == (
+        "unknown" if tells else "stable"
+    )
 
 
 def test_a_collision_breaks_the_flight_and_least_distance_is_summarised() -> None:

@@ -23,7 +23,8 @@ from scenarios.schema import ClockJump, NominalVelocity
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
-from tests.support.sim_client import command
+from tests.support.fleets.pilots import PilotsVehicle
+from tests.support.sim_client import command, parse
 from tests.support.station_peer import HOME, Peer, messages
 
 PERIOD_S = 0.02
@@ -352,3 +353,25 @@ def test_a_gimbal_with_the_same_system_id_is_no_vehicle() -> None:
     assert station.counters["other component"] == 1
     assert station.end_reason == ""
     assert messages(outgoing, "COMMAND_LONG") == []  # one command is in flight already
+
+
+def test_a_vehicle_that_reports_no_motion_is_not_blamed_for_its_telemetry() -> None:
+    """Vehicle 3 always reports the velocity 0."""
+
+    def at_rest(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
+        message = parse(data)
+        if message.get_type() != "LOCAL_POSITION_NED":
+            return [(data, now_ns)]
+        message.vx = message.vy = message.vz = 0.0
+        link: Any = dialect.MAVLink(None, srcSystem=3, srcComponent=1)
+        link.seq = message.get_seq()
+        return [(bytes(message.pack(link)), now_ns)]
+
+    station, vehicles = (
+        Station(planned("ardupilot"), start_ns=START_NS),
+        PilotsVehicle(Fleet(three(), START_NS), "", {}),
+    )
+    vehicles.change = at_rest
+    for _ in fly_lockstep(station.plan, station=station, vehicles=vehicles):
+        pass
+    assert station.end_reason.startswith("not identified: vehicle 3 reported the same velocity throughout a manoeuvre")

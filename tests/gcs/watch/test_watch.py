@@ -375,3 +375,14 @@ def test_a_second_vehicle_with_the_same_id_is_counted_apart() -> None:
     assert figures.telemetry_hz == pytest.approx(20.0)
     assert (figures.received, figures.late) == (100, 0)
     assert watch.counters == {"known system id from another address": 100}
+
+
+def test_a_delay_is_unknown_once_exchanges_have_stopped() -> None:
+    """The links may have become slower since."""
+    watched = Watched(linked(Link(delay_s=0.02), Link(delay_s=0.02)), timesync_hz=10.0)
+    for timesync_hz, status in ((10.0, "measured"), (0.0, "no exchange")):
+        watched.requests = Requests(timesync_hz)
+        watched.run(5.0)
+        vehicle = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3), last=20)[0]
+        assert (vehicle.status, vehicle.headroom is None) == (status, status == "no exchange")
+    assert vehicle.telemetry_age_s.p50 is not None
