@@ -392,7 +392,7 @@ class Station:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
                 self._busy.add(row)
             if after.mode is not before.mode:
-                self._change_mode(vehicle, before.mode, after.mode, outgoing)
+                self._change_mode(row, before.mode, after.mode, outgoing)
             if after.released != before.released and flying:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)
@@ -468,11 +468,12 @@ class Station:
 
     # -- sending and reporting -------------------------------------------------------------------------------------
 
-    def _change_mode(self, vehicle: RemoteVehicle, before: Mode, after: Mode, outgoing: Outbox) -> None:
+    def _change_mode(self, row: int, before: Mode, after: Mode, outgoing: Outbox) -> None:
         """Report a change of mode; the vehicle may be CRITICAL because its headroom is unknown."""
+        vehicle = self.vehicles[row]
         self._report("mode", f"{before.name} -> {after.name}", vehicle.system_id)
         self._tell(vehicle, after, after.name, outgoing)
-        if after is Mode.CRITICAL and vehicle.clock.unanswered >= UNANSWERED:
+        if after is Mode.CRITICAL and vehicle.clock.unanswered >= UNANSWERED and np.isnan(self._used_s[row]):
             self._report("vehicle", "does not answer TIMESYNC: its loop delay is unknown", vehicle.system_id)
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
