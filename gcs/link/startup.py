@@ -54,9 +54,6 @@ class Startup(Protocol):
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         """Process a message from the vehicle; most do not concern the start-up."""
 
-    def disarmed(self) -> None:
-        """Note that somebody else has disarmed the vehicle; this station disarms none."""
-
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
         """The next step towards taking set-points."""
         ...
@@ -66,6 +63,7 @@ class Startup(Protocol):
         ...
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
+    def disarmed(self) -> None: ...  # by somebody else: this station disarms none
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
