@@ -11,7 +11,7 @@ from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, Kind, Step, mode_command, packed
 
 ARM = ARM_DISARM, (1.0,)
-STAYS_DISARMED = "stays disarmed: it has landed or was disarmed"
+STAYS_DISARMED = "has landed and is not armed again"
 ARDUPILOT, PX4 = 3, 12
 """Values of MAV_AUTOPILOT."""
 _MULTICOPTERS = {2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"}
@@ -70,7 +70,7 @@ class Seen(NamedTuple):
     custom_mode: int
     armed: bool
     has_landed: bool
-    """It is on the ground, and has been in the air in this flight or was disarmed by somebody."""
+    """It has been in the air in this flight and is back on the ground."""
     took_off: bool
     airborne: bool
     relative_altitude_m: float | None

@@ -50,9 +50,7 @@ class AutopilotStartup(Startup):
         self.origin_altitude_m = 0.0
         """Above sea level; valid only once the origin is known."""
         self.limits = ToldLimits()
-        self._armed = self._standby = self._restarted = False
-        self._has_flown = False
-        """Whether it has been in the air, or disarmed by somebody: on the ground it stays disarmed."""
+        self._armed = self._standby = self._has_flown = self._restarted = False
         self._text = ""
         """The last text received; cleared by armed heartbeats."""
         self._origin_said = False
@@ -144,7 +142,7 @@ class AutopilotStartup(Startup):
         self._judge_ground()
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None:
-            self._reported = boot_ms, relative_mm * 1e-3 + self._local[3]
+            self._reported = boot_ms, self.relative_altitude_m + self._local[3]
         if self._local is not None and not self._origin_said and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
             since_s = (boot_ms - local_ms) * 1e-3
@@ -158,9 +156,6 @@ class AutopilotStartup(Startup):
             self._accepted.add(parameters[0])
         elif command == TAKE_OFF:
             self._took_off_ns = now_ns
-
-    def disarmed(self) -> None:
-        self._has_flown = True
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
         """Accept a refused rate of the origin, which other messages contain too, or of the optional active target.

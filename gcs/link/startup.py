@@ -32,7 +32,7 @@ class Startup(Protocol):
     refusal: str = ""
     """Why the vehicle must not be flown; empty if it may."""
     has_landed: bool = False
-    """Whether it is on the ground, and has been in the air in this flight or was disarmed by somebody."""
+    """Whether it has been in the air in this flight and is back on the ground."""
     stranger: bool = False
     """Whether the vehicle has yet to say that it is simulated; until then it is commanded nothing."""
     arming_refusals: int = 0
@@ -63,7 +63,6 @@ class Startup(Protocol):
         ...
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
-    def disarmed(self) -> None: ...  # by somebody else: this station disarms none
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 

@@ -430,40 +430,33 @@ class RemoteVehicle:
         if self.kind.piloted:
             self.clock.expected_error_ns = self.kind.timesync_error_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
-        if self.armed and not armed:
-            self.startup.disarmed()
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe", self.system_id)
         elif was_guided and not self.guided and not critical:
-            stays = custom_mode == self.kind.guided_mode and not armed
-            self._report("vehicle", "was disarmed" if stays else f"left {self.kind.guided_name}", self.system_id)
+            self._report("vehicle", f"left {self.kind.guided_name}", self.system_id)
         self.critical = critical
         self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
         """Detect from a reported mode that somebody else has taken the vehicle over, or handed it back.
 
-        A mode to which no command of the station leads is somebody's choice, except that a vehicle in failsafe may hold
-        by itself. So is arming that the station has not commanded. Before arming, anybody may set any mode.
+        A mode to which no command of the station leads is somebody's choice, unless the vehicle reports a failsafe. On
+        the ground, before arming, anybody may set any mode.
         """
         kind, before = self.kind, self.custom_mode
         if self.external:
             return
-        holds_by_itself = critical and mode == kind.hold_mode
         if mode == kind.guided_mode:
             self.has_been_guided = True
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
-        elif self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
+        elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
-        elif mode == before:
-            arms = self._command is not None and self._command.command == ARM_DISARM
-            self.taken_over = armed and not self.armed and not arms
         elif before == kind.guided_mode:
-            self.taken_over = kind.stays_guided or not holds_by_itself
+            self.taken_over = kind.stays_guided or not critical
         elif before < 0:
-            self.taken_over = armed and mode not in (kind.hold_mode, kind.take_off_mode)
-        elif (armed or self.armed) and not holds_by_itself:
+            self.taken_over = armed and not critical and mode not in (kind.hold_mode, kind.take_off_mode)
+        elif (armed or self.armed) and not critical:
             self.taken_over = not self._takes_off_by(mode)
         if self.taken_over:
             self._command = None  # resending it would take the vehicle back

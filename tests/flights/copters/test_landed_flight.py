@@ -29,7 +29,7 @@ def test_a_vehicle_landed_by_its_pilot_stays_disarmed_in_guided(flavour: str) ->
     assert own.told
     assert own.commanded == []
     texts = [event.text for event in station.events if event.system_id == 3]
-    assert texts.count("stays disarmed: it has landed or was disarmed") == 1
+    assert texts.count("has landed and is not armed again") == 1
     assert station.end_reason == "landed: vehicles 3"
     assert abs(error_m) < 0.17  # the others fly on
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import pytest
 
-from gcs.autopilot.startup import AutopilotStartup
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
@@ -14,16 +13,7 @@ from scenarios.schema import ClockJump, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.flown_copters import COPTERS5, plan_for
-from tests.support.fleets.pilots import (
-    LOITER,
-    PILOTS_MODE,
-    POSCTL,
-    RTL,
-    SET_MESSAGE_INTERVAL,
-    PilotsVehicle,
-    flight_s,
-    flown,
-)
+from tests.support.fleets.pilots import PILOTS_MODE, POSCTL, RTL, SET_MESSAGE_INTERVAL, PilotsVehicle, flight_s, flown
 from tests.support.sim_client import SECOND, parse
 
 
@@ -136,8 +126,7 @@ def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_th
 def test_a_px4_pilot_intervening_before_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
     """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
     station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
-    on_ground = "stays disarmed: it has landed or was disarmed"
-    flown_by = on_ground, "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
+    flown_by = "has landed and is not armed again", "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
     assert station.vehicles[2].missing == flown_by[pilots.copter.armed]
     assert_left_alone(pilots, pilots.copter.mode)
     assert pilots.copter.mode != RULES["px4"].guided_mode  # a pilot's return ends in a landing
@@ -240,43 +229,3 @@ def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     assert heartbeat(4, armed=False, at_s=1.5) == (4, True)
     assert heartbeat(5, armed=True, at_s=1.6) == (5, True)  # which it was not in before: that is news
     assert heartbeat(0, armed=False, at_s=3.0) == (0, False)
-
-
-FLIES, ON_GROUND, CRITICAL = 4, 3, 5
-ARDUPILOT, PX4 = 3, 12
-GUIDED, OFFBOARD, PX4_HOLD = RULES["ardupilot"].guided_mode, RULES["px4"].guided_mode, RULES["px4"].hold_mode
-
-
-def seen(autopilot: int, *states: tuple[int, bool, int]) -> tuple[RemoteVehicle, list[str]]:
-    """A vehicle whose heartbeats, one a second, show these modes, armed or not, and states; and the events of it."""
-    texts = list[str]()
-    startup = AutopilotStartup(altitude_m=5.0, telemetry_hz=50.0)
-    vehicle = RemoteVehicle(3, startup=startup, report=lambda kind, text, system_id: texts.append(text))  # noqa: ARG005
-    for k, (mode, armed, status) in enumerate(states):
-        fields = mode, 2, autopilot, 0x80 * armed, status, 3
-        vehicle.heartbeat(fields, k * SECOND)
-        vehicle.tell_startup(0, fields)
-    return vehicle, texts
-
-
-def test_a_vehicle_that_somebody_disarmed_is_not_armed_again() -> None:
-    vehicle, texts = seen(ARDUPILOT, (GUIDED, True, ON_GROUND), (GUIDED, False, ON_GROUND), (GUIDED, False, ON_GROUND))
-    assert texts == ["was disarmed"]
-    assert vehicle.startup.has_landed
-
-
-@pytest.mark.parametrize(
-    ("autopilot", "states", "taken_over"),
-    [
-        (ARDUPILOT, [(LOITER, True, CRITICAL)], True),  # found in the air
-        (ARDUPILOT, [(0, False, ON_GROUND), (0, True, FLIES)], True),  # armed by hand
-        (ARDUPILOT, [(0, False, ON_GROUND), (0, False, ON_GROUND)], False),
-        (PX4, [(OFFBOARD, True, FLIES), (POSCTL, True, CRITICAL)], True),
-        (PX4, [(OFFBOARD, True, FLIES), (PX4_HOLD, True, CRITICAL)], False),  # its failsafe without set-points
-        (PX4, [(PX4_HOLD, True, CRITICAL), (POSCTL, True, CRITICAL)], True),
-    ],
-)
-def test_a_failsafe_or_an_unchanged_mode_hides_no_pilot(
-    autopilot: int, states: list[tuple[int, bool, int]], taken_over: bool
-) -> None:
-    assert seen(autopilot, *states)[0].taken_over == taken_over

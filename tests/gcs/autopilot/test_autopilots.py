@@ -9,7 +9,6 @@ from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Seen, kind_of, next_step
 from gcs.autopilot.startup import AutopilotStartup, between, shifted
 from gcs.control.history import StateHistory
 from gcs.link.kinds import UNRECOGNISED, Kind, commanded_mode, mode_command
-from gcs.link.vehicle import ignored
 from tests.support.fleets.flown_copters import plan_for, three
 
 ALTITUDE_M = 20.0
@@ -128,7 +127,7 @@ def test_a_landed_vehicle_that_its_pilot_flies_again_is_flown() -> None:
     assert not startup.has_landed
 
 
-def test_the_drift_of_a_barometer_is_no_flight() -> None:
+def test_before_its_flight_a_vehicle_is_armed_again_and_again() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.recognise(3, 2)
     for base_mode in (0x80, 0, 0x80, 0):
@@ -234,7 +233,7 @@ def test_a_restarted_vehicle_has_to_say_its_origin_again() -> None:
 
 
 def test_states_in_a_frame_of_before_a_restart_are_dropped() -> None:
-    fleet, history = AutopilotFleet(plan_for(three()), ignored), StateHistory(3)
+    fleet, history = AutopilotFleet(plan_for(three()), lambda *_: None), StateHistory(3)
     for startup in fleet.starts:
         startup.take(49, (471000000, 81000000, 400_000, 0))
     fleet.locate(history)
