@@ -26,8 +26,8 @@ class Startup(Protocol):
     kind: Kind
     refusal: str = ""
     """Why the vehicle must not be flown; empty if it may."""
-    has_landed: bool = False
-    """Whether it has been in the air in this flight and is on the ground again."""
+    stays_disarmed: str = ""
+    """Why the station must not arm it: it has landed, or somebody has disarmed it. Empty if it may."""
     arming_refusals: int = 0
     """How often it has refused to arm since it was armed last."""
 
@@ -57,6 +57,7 @@ class Startup(Protocol):
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
+    def disarmed(self) -> None: ...  # by somebody else, as the station never does it
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
 

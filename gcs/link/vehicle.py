@@ -325,7 +325,7 @@ class RemoteVehicle:
         """What keeps the vehicle from being ready, in words; empty if it is ready."""
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
-        if self.taken_over and not self.startup.has_landed:
+        if self.taken_over and not self.startup.stays_disarmed:
             left = "left" if self._has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         return self._next_step().missing
@@ -410,11 +410,13 @@ class RemoteVehicle:
         if self.kind.piloted:
             self.clock.expected_error_ns = self.kind.timesync_error_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
+            if self.armed and not armed:
+                self.startup.disarmed()
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe", self.system_id)
         elif was_guided and not self.guided and not critical:
-            self._report("vehicle", f"left {self.kind.guided_name}", self.system_id)
+            self._report("vehicle", f"left {self.kind.guided_name}" if armed else "was disarmed", self.system_id)
         self.critical = critical
         self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
@@ -516,7 +518,7 @@ class RemoteVehicle:
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
             self._earlier = 0, 0  # an answer to an earlier request would have come
-            revocable = waiting.command == SET_MODE or self.startup.has_landed
+            revocable = waiting.command in (SET_MODE, ARM_DISARM) or self.startup.stays_disarmed
             if revocable and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None
         if waiting is None:

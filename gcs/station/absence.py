@@ -1,8 +1,8 @@
-"""Which vehicles are absent: those that are lost, that have landed, or that a pilot or autopilot flies."""
+"""Which vehicles are absent: those that are lost, that stay disarmed, or that a pilot or autopilot flies."""
 
 from collections.abc import Sequence
 
-from gcs.autopilot.kinds import STAYS_DISARMED
+from gcs.autopilot.kinds import HAS_LANDED, WAS_DISARMED
 from gcs.link.vehicle import RemoteVehicle
 
 LOST, TAKEN_OVER = "is lost", "is taken over by its pilot or its autopilot"
@@ -16,13 +16,11 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
         return LEFT_OUT
     if gone:
         return LOST
-    if vehicle.startup.has_landed:
-        return STAYS_DISARMED
-    return TAKEN_OVER if vehicle.taken_over else ""
+    return vehicle.startup.stays_disarmed or (TAKEN_OVER if vehicle.taken_over else "")
 
 
-PILOTED = (TAKEN_OVER, STAYS_DISARMED)
-"""Why a vehicle is absent that its pilot flies or has landed."""
+PILOTED = (TAKEN_OVER, HAS_LANDED, WAS_DISARMED)
+"""Why a vehicle is absent that its pilot flies, or has landed or disarmed."""
 
 
 def describe_change(was: str, now: str) -> str:
@@ -34,7 +32,10 @@ def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
     """Why a flight ends: its duration has passed, or no vehicle is left. Absent vehicles are named."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
-    kinds = (("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", STAYS_DISARMED))
+    kinds = (
+        ("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", HAS_LANDED),
+        ("disarmed", WAS_DISARMED),
+    )  # fmt: skip
     gone = {
         word: ", ".join(str(v.system_id) for v, reason in zip(vehicles, absent, strict=True) if reason == kind)
         for word, kind in kinds
