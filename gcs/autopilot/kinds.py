@@ -26,7 +26,6 @@ ARDUCOPTER = Kind(
     hold_mode=17,  # BRAKE: LOITER would follow the pilot's sticks
     land_mode=9,
     estimator_message=mavlink.EKF_STATUS_REPORT,
-    stays_guided=True,
     velocity_grows=True,
     timesync_error_ns=5_000_000,  # backdated by the bytes' time on a serial port, 3.5 ms at 57600 baud
 )
@@ -36,6 +35,7 @@ PX4_COPTER = Kind(
     hold_mode=packed(4, 3),
     land_mode=packed(4, 6),
     take_off_mode=packed(4, 2),
+    failsafe_mode=packed(4, 3),  # COM_OBL_RC_ACT: others let its pilot steer, or are those of a low battery
     guided_name="OFFBOARD",
     estimator_message=mavlink.ESTIMATOR_STATUS,
     guided_first=False,

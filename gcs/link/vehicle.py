@@ -423,8 +423,9 @@ class RemoteVehicle:
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
         """Notice from a reported mode that somebody else has taken the vehicle over, or given it back.
 
-        A mode that no command of the station leads to is somebody's choice, unless the vehicle reports a failsafe. On
-        the ground, before arming, anybody may set any mode.
+        A mode that no command of the station leads to is somebody's choice, unless the vehicle enters it when
+        set-points stop. That it reports a failsafe does not suffice: its pilot may steer it, or it flies home on a low
+        battery. On the ground, before arming, anybody may set any mode.
         """
         kind, before = self.kind, self.custom_mode
         if self.external:
@@ -434,12 +435,10 @@ class RemoteVehicle:
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
         elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
-        elif before == kind.guided_mode:
-            self.taken_over = kind.stays_guided or not critical
         elif before < 0:
-            self.taken_over = armed and not critical and mode not in (kind.hold_mode, kind.take_off_mode)
-        elif (armed or self.armed) and not critical:
-            self.taken_over = not self._takes_off_by(mode)
+            self.taken_over = armed and mode not in (kind.hold_mode, kind.take_off_mode)
+        elif armed or self.armed or before == kind.guided_mode:
+            self.taken_over = not (self._takes_off_by(mode) or (critical and mode == kind.failsafe_mode))
         if self.taken_over:
             self._command = None  # repeating it would take the vehicle back
 

@@ -2,7 +2,9 @@
 
 from typing import Any
 
-from gcs.autopilot.kinds import PX4
+import pytest
+
+from gcs.autopilot.kinds import ARDUPILOT, PX4, PX4_COPTER
 from gcs.autopilot.startup import AutopilotStartup
 from gcs.link import mavlink
 from gcs.link.clocks import LEAST_SAMPLES
@@ -12,13 +14,13 @@ from scenarios.schema import NS_PER_S
 from tests.support.sim_client import parse
 
 ACTIVE, STANDBY, CRITICAL = 4, 3, 5
-STABILIZE, GUIDED, LOITER, RTL = 0, 4, 5, 6
+STABILIZE, GUIDED, LOITER, RTL, POSCTL = 0, 4, 5, 6, 3 << 16
 
 
 class Talk:
     """A vehicle with an autopilot at a station, which knows all that it needs but its heartbeats."""
 
-    def __init__(self, autopilot: int = 3) -> None:
+    def __init__(self, autopilot: int = ARDUPILOT) -> None:
         self.texts: list[str] = []
         startup = AutopilotStartup(altitude_m=5.0, telemetry_hz=50.0)
         self.vehicle = RemoteVehicle(2, startup=startup, report=lambda _kind, text, _id: self.texts.append(text))
@@ -71,3 +73,24 @@ def test_a_vehicle_that_somebody_disarms_is_not_armed_again() -> None:
     assert talk.vehicle.missing == "was disarmed and is not armed again"
     talk.heartbeat(GUIDED, armed=True)  # by its pilot
     assert talk.told() == [TAKE_OFF]
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "modes"),
+    [
+        (ARDUPILOT, (LOITER,)),
+        (ARDUPILOT, (RTL,)),  # on a low battery
+        (ARDUPILOT, (GUIDED, RTL)),
+        (PX4, (POSCTL,)),
+        (PX4, (PX4_COPTER.guided_mode, POSCTL)),
+        (PX4, (PX4_COPTER.guided_mode, PX4_COPTER.hold_mode, POSCTL)),
+    ],
+)
+def test_a_failsafe_takes_no_vehicle_from_its_pilot(autopilot: int, modes: tuple[int, ...]) -> None:
+    talk = Talk(autopilot)
+    talk.rise(8.0)
+    for mode in modes:
+        guided = mode == talk.vehicle.kind.guided_mode
+        talk.heartbeat(mode, armed=True, status=ACTIVE if guided else CRITICAL)
+    assert talk.told() == []
+    assert talk.vehicle.taken_over
