@@ -255,6 +255,8 @@ class RemoteVehicle:
         One with an autopilot never counts as settled, because its start-up counts time."""
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still come."""
+        self._unanswered_ns = 0
+        """When the last ARM was sent of which it is not known what became of it; 0 if there is none."""
         self._not_before_ns = 0
         self._outdated: list[tuple[int, int, bool]] = []
         """Time of the ACK of each recent command that changed mode or arming, with the mode and arming before it. A
@@ -412,6 +414,8 @@ class RemoteVehicle:
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
             if self.armed and not armed:
                 self.startup.disarmed()
+        if self._unanswered_ns < recent_ns:
+            self._unanswered_ns = 0
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe", self.system_id)
@@ -421,11 +425,12 @@ class RemoteVehicle:
         self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
-        """Notice from a reported mode that somebody else has taken the vehicle over, or given it back.
+        """Notice from a reported mode or arming that somebody else has taken the vehicle over, or given it back.
 
         A mode that no command of the station leads to is somebody's choice, unless the vehicle enters it when
         set-points stop. That it reports a failsafe does not suffice: its pilot may steer it, or it flies home on a low
-        battery. On the ground, before arming, anybody may set any mode.
+        battery. On the ground, before arming, anybody may set any mode. Who arms a vehicle flies it, unless it holds:
+        then it waits for its take-off.
         """
         kind, before = self.kind, self.custom_mode
         if self.external:
@@ -433,10 +438,12 @@ class RemoteVehicle:
         if mode == kind.guided_mode:
             self._has_been_guided = True
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
-        elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
+        elif self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
         elif before < 0:
             self.taken_over = armed and mode not in (kind.hold_mode, kind.take_off_mode)
+        elif mode == before:
+            self.taken_over = armed and not (self.armed or self._unanswered_ns or mode == kind.hold_mode)
         elif armed or self.armed or before == kind.guided_mode:
             self.taken_over = not (self._takes_off_by(mode) or (critical and mode == kind.failsafe_mode))
         if self.taken_over:
@@ -464,7 +471,7 @@ class RemoteVehicle:
         if earlier == command and answers > 0 and now_ns - waiting.sent_ns < (self.clock.rtt_ns or 0):
             self._earlier = earlier, answers - 1  # too soon for an answer to this request
             return
-        self._command = None
+        self._command, self._unanswered_ns = None, 0
         self._earlier = command, waiting.confirmation
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
@@ -526,6 +533,8 @@ class RemoteVehicle:
                 return None
             waiting = self._command = _Waiting(*wanted, sent_ns=now_ns)
             self._take_off_sent = self._take_off_sent or waiting.command == TAKE_OFF
+        if waiting.command == ARM_DISARM:
+            self._unanswered_ns = now_ns
         return self.encode(
             mavlink.COMMAND_LONG,
             mavlink.command_long(

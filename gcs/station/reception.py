@@ -387,6 +387,7 @@ def _take_position(
         link.local[k] = state[k]
     sample_ns = sampled_ns(clock, boot_ms, received_ns, link.newest)
     if link.left_out:
+        tables.telemetry_ns[row] = received_ns
         return  # on the ground, others may fly over it
     if sample_ns == UNKNOWN:
         if not (clock.lost or clock.doubtful_state):

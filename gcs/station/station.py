@@ -409,7 +409,7 @@ class Station:
         """Take in what may have changed of vehicles."""
         for row in rows:
             vehicle = self.vehicles[row]
-            self._guided[row], self._critical[row] = vehicle.guided, vehicle.critical
+            self._guided[row], self._critical[row] = vehicle.guided and not vehicle.left_out, vehicle.critical
             self._why_absent[row] = absence(vehicle, gone=False)
             self._busy.add(row)
 

@@ -8,7 +8,7 @@ from gcs.autopilot.kinds import ARDUPILOT, PX4, PX4_COPTER
 from gcs.autopilot.startup import AutopilotStartup
 from gcs.link import mavlink
 from gcs.link.clocks import LEAST_SAMPLES
-from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, TAKE_OFF
+from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, TAKE_OFF, Goal
 from gcs.link.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
 from tests.support.sim_client import parse
@@ -94,3 +94,17 @@ def test_a_failsafe_takes_no_vehicle_from_its_pilot(autopilot: int, modes: tuple
         talk.heartbeat(mode, armed=True, status=ACTIVE if guided else CRITICAL)
     assert talk.told() == []
     assert talk.vehicle.taken_over
+
+
+def test_who_arms_a_vehicle_in_the_mode_it_had_flies_it() -> None:
+    talk = Talk()
+    talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x481)  # no position yet
+    talk.heartbeat(STABILIZE, armed=False)
+    assert talk.told() == []
+    talk.heartbeat(STABILIZE, armed=True, status=ACTIVE)
+    talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x33F)
+    talk.rise(7.5)
+    assert talk.told() == []
+    talk.vehicle.goal = Goal.END
+    assert talk.told() == []
+    assert talk.vehicle.missing == "is armed and not in GUIDED: flown by its pilot or its autopilot"
