@@ -256,7 +256,7 @@ class RemoteVehicle:
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still come."""
         self._unanswered_ns = 0
-        """When the last ARM was sent of which it is not known what became of it; 0 if there is none."""
+        """When the last ARM or TAKE_OFF was sent of which it is not known what became of it; 0 if there is none."""
         self._not_before_ns = 0
         self._outdated: list[tuple[int, int, bool]] = []
         """Time of the ACK of each recent command that changed mode or arming, with the mode and arming before it. A
@@ -279,11 +279,11 @@ class RemoteVehicle:
     @property
     def ended(self) -> bool:
         """Whether the vehicle holds or lands, or is not ours to end: it never took off, or somebody else flies it."""
-        if self.external:
+        if self.external or self.taken_over:
             return True
-        if self.kind.piloted and (self.kind is UNRECOGNISED or not self.armed):
+        if self.kind.piloted and (self.kind is UNRECOGNISED or not (self.armed or self._unanswered_ns)):
             return True
-        return self.taken_over or self.custom_mode == self.end_mode
+        return self.custom_mode == self.end_mode and not self._unanswered_ns
 
     @property
     def guided(self) -> bool:
@@ -324,9 +324,11 @@ class RemoteVehicle:
 
     @property
     def missing(self) -> str:
-        """What keeps the vehicle from being ready, in words; empty if it is ready."""
+        """What keeps the vehicle from being ready or, at the end, from having ended, in words; "" if nothing does."""
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
+        if self.goal is Goal.END:
+            return "" if self.ended else f"does not {'land' if self._land else 'hold'}"
         if self.taken_over and not self.startup.stays_disarmed:
             left = "left" if self._has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
@@ -533,7 +535,7 @@ class RemoteVehicle:
                 return None
             waiting = self._command = _Waiting(*wanted, sent_ns=now_ns)
             self._take_off_sent = self._take_off_sent or waiting.command == TAKE_OFF
-        if waiting.command == ARM_DISARM:
+        if waiting.command in (ARM_DISARM, TAKE_OFF):
             self._unanswered_ns = now_ns
         return self.encode(
             mavlink.COMMAND_LONG,
@@ -564,6 +566,13 @@ class RemoteVehicle:
         )
         asks = step.command is not None and step.command[0] == SET_MESSAGE_INTERVAL
         return Step(step.missing) if self.external and not asks else step
+
+    def end(self, *, alone: bool = False) -> None:
+        """Let it hold or land from now on, or leave it alone. What is not answered yet is repeated no more, but for a
+        mode: an answer does not say which mode it is to."""
+        self.goal = None if alone else Goal.END
+        if self._command is not None and self._command.command != SET_MODE:
+            self._command = None
 
     def begin_anew(self) -> None:
         """Set rates and parameters again: the vehicle seems to have restarted.

@@ -17,11 +17,11 @@ from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import Moment, Orders
 from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
-from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.control.tick import GAIN_SET, NOT_CONFIRMED, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, note_requests, set_points_to
+from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, in_words, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
@@ -450,11 +450,19 @@ class Station:
             # A broken formation is left to its failsafe, if that holds the vehicles: what broke may be the link.
             alone = self._journal.stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
-                vehicle.goal = None if alone else Goal.END
+                vehicle.end(alone=alone)
             self._busy.update(range(len(self.vehicles)))
+        self._report_not_confirmed()
         self._report("phase", str(phase))
 
     # -- sending and reporting -------------------------------------------------------------------------------------
+
+    def _report_not_confirmed(self) -> None:
+        """After the flight: report the vehicles that were told to hold or land, and have not confirmed it in time."""
+        told = (vehicle for vehicle in self.vehicles if vehicle.address is not None and vehicle.goal is Goal.END)
+        late = [vehicle for vehicle in told if not vehicle.ended]
+        if self.phase is Phase.ENDED and late:
+            self._report(NOT_CONFIRMED, in_words("", late))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""

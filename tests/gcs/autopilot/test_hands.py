@@ -8,7 +8,7 @@ from gcs.autopilot.kinds import ARDUPILOT, PX4, PX4_COPTER
 from gcs.autopilot.startup import AutopilotStartup
 from gcs.link import mavlink
 from gcs.link.clocks import LEAST_SAMPLES
-from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, TAKE_OFF, Goal
+from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, TAKE_OFF
 from gcs.link.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
 from tests.support.sim_client import parse
@@ -105,6 +105,19 @@ def test_who_arms_a_vehicle_in_the_mode_it_had_flies_it() -> None:
     talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x33F)
     talk.rise(7.5)
     assert talk.told() == []
-    talk.vehicle.goal = Goal.END
-    assert talk.told() == []
     assert talk.vehicle.missing == "is armed and not in GUIDED: flown by its pilot or its autopilot"
+    talk.vehicle.end()
+    assert talk.told() == []
+
+
+@pytest.mark.parametrize("mode", [GUIDED, PX4_COPTER.hold_mode])
+def test_arming_under_way_at_the_end_is_followed_by_hold(mode: int) -> None:
+    talk = Talk(ARDUPILOT if mode == GUIDED else PX4)
+    talk.heartbeat(mode, armed=False)
+    assert talk.told(answers=False, seconds=0.5) == [ARM_DISARM]
+    talk.vehicle.end()
+    assert not talk.vehicle.ended
+    assert talk.told(answers=False, seconds=0.5) == [SET_MODE]
+    assert talk.vehicle.missing == "does not hold"
+    assert talk.told(seconds=1.5) == [SET_MODE]  # not the arming again
+    assert talk.vehicle.ended
