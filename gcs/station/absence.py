@@ -19,7 +19,9 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
     return vehicle.startup.stays_disarmed or (TAKEN_OVER if vehicle.taken_over else "")
 
 
-PILOTED = (TAKEN_OVER, HAS_LANDED, WAS_DISARMED)
+GROUNDED = (HAS_LANDED, WAS_DISARMED)
+"""Why a vehicle is absent that is on the ground, where others may fly over it."""
+PILOTED = (TAKEN_OVER, *GROUNDED)
 """Why a vehicle is absent that its pilot flies, or has landed or disarmed."""
 
 

@@ -23,7 +23,7 @@ from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, in_words, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
+from gcs.station.absence import GROUNDED, LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
@@ -259,7 +259,7 @@ class Station:
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
         down_m = judged.reported["down_m"] if self._limits.has_slots else np.empty(0)
-        near = nearest(judged.controls, tick.due_ns, down_m)
+        near = nearest(self._off_the_ground(judged.controls), tick.due_ns, down_m)
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)
@@ -269,6 +269,14 @@ class Station:
         own_ns = at_ns[tick.set_point_indices]  # -1 finds the last one, for vehicles that were sent none
         rows, self._used_s[:] = tick_rows(tick, judged, self._fleet.links, near.distance_m, own_ns)
         return rows
+
+    def _off_the_ground(self, controls: Records) -> Records:
+        """The controls without the states of vehicles on the ground: they are not near those that fly over them."""
+        grounded = [row for row, why in enumerate(self._why_absent) if why in GROUNDED]
+        if grounded:
+            controls = controls.copy()
+            controls["state"][grounded] = nan
+        return controls
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
