@@ -163,7 +163,7 @@ class AutopilotFleet(Fleet):
         if vehicle.left_out:
             return None
         piloted = vehicle.taken_over and vehicle.kind.guided_first
-        if vehicle.external or self.starts[row].has_landed or piloted:
+        if vehicle.external or self.starts[row].stays_disarmed or piloted:
             self._rest(row)
             return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)

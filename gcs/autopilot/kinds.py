@@ -11,7 +11,7 @@ from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, Kind, Step, mode_command, packed
 
 ARM = ARM_DISARM, (1.0,)
-STAYS_DISARMED = "has landed and is not armed again"
+HAS_LANDED, WAS_DISARMED = "has landed and is not armed again", "was disarmed and is not armed again"
 ARDUPILOT, PX4 = 3, 12
 """Values of MAV_AUTOPILOT."""
 _MULTICOPTERS = {2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"}
@@ -26,7 +26,6 @@ ARDUCOPTER = Kind(
     hold_mode=17,  # BRAKE: LOITER would follow the pilot's sticks
     land_mode=9,
     estimator_message=mavlink.EKF_STATUS_REPORT,
-    stays_guided=True,
     velocity_grows=True,
     timesync_error_ns=5_000_000,  # stamps are backdated by the transfer time on a serial port, 3.5 ms at 57600 baud
 )
@@ -36,6 +35,7 @@ PX4_COPTER = Kind(
     hold_mode=packed(4, 3),
     land_mode=packed(4, 6),
     take_off_mode=packed(4, 2),
+    failsafe_mode=packed(4, 3),  # COM_OBL_RC_ACT: others let its pilot steer, or are those of a low battery
     guided_name="OFFBOARD",
     estimator_message=mavlink.ESTIMATOR_STATUS,
     guided_first=False,
@@ -69,8 +69,8 @@ class Seen(NamedTuple):
     origin_known: bool
     custom_mode: int
     armed: bool
-    has_landed: bool
-    """It has been in the air in this flight and is back on the ground."""
+    stays_disarmed: str
+    """Why the station must not arm it; empty if it may."""
     took_off: bool
     airborne: bool
     relative_altitude_m: float | None
@@ -82,7 +82,8 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
     """The next step of the start-up. It depends on `seen` alone, so a vehicle found in the air continues from there.
 
     All need rates, clock and position. ArduCopter then becomes guided, is armed and takes off; PX4 is armed, takes off
-    and becomes guided (OFFBOARD) once set-points arrive. A vehicle that has landed gets no mode or arming command.
+    and becomes guided (OFFBOARD) once set-points arrive. One that stays disarmed gets no mode or
+    arming command.
     """
     if seen.interval_due is not None:
         text = f"does not accept the rate of message {seen.interval_due[0]:.0f}"
@@ -105,8 +106,8 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
 def _lacks(kind: Kind, seen: Seen) -> str:
     """What the vehicle lacks that no command can provide; empty if nothing."""
     flags = seen.estimator_flags
-    if seen.has_landed or not seen.clock_known:
-        return STAYS_DISARMED if seen.has_landed else "does not answer TIMESYNC"
+    if seen.stays_disarmed or not seen.clock_known:
+        return seen.stays_disarmed or "does not answer TIMESYNC"
     if flags is None:
         return f"sends no estimator status (message {kind.estimator_message})"
     if flags & _POSITION_FLAGS != _POSITION_FLAGS or flags & _CONSTANT_POSITION:

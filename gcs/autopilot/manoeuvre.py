@@ -76,7 +76,7 @@ class Identification:
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
         """The plan with the margins of the identified responses, or why there is none; None while still at work."""
-        gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.has_landed), None)
+        gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.stays_disarmed), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"
         if self._run_up is None:

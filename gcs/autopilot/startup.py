@@ -7,7 +7,7 @@ both frames; or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
 from math import cos, degrees, isfinite, radians
 from typing import Any
 
-from gcs.autopilot.kinds import ARM, Seen, kind_of, next_step
+from gcs.autopilot.kinds import ARM, HAS_LANDED, WAS_DISARMED, Seen, kind_of, next_step
 from gcs.autopilot.vehicle_limits import ToldLimits
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
@@ -37,8 +37,8 @@ Degrees = tuple[float, float]
 class AutopilotStartup(Startup):
     """Start-up of one vehicle, which takes off to `altitude_m`.
 
-    A vehicle that has been in the air and is back on the ground is never armed again: people may be near it. The pilot
-    may take off again.
+    A vehicle that has been in the air and is back on the ground, or that somebody has disarmed, is never armed again:
+    people may be near it. Its pilot may arm it, and must take off a vehicle that has landed.
     """
 
     def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
@@ -123,10 +123,10 @@ class AutopilotStartup(Startup):
         """Decide from the newest heartbeat and altitude whether the vehicle has taken off or landed."""
         above_home_m = self.relative_altitude_m or 0.0
         self._has_flown |= self._armed and above_home_m > _HAS_FLOWN_M
-        if not self._armed or self._standby:
-            self.has_landed = self._has_flown
-        elif above_home_m > _FLIES_M:
-            self.has_landed = False
+        if self._has_flown and (not self._armed or self._standby):
+            self.stays_disarmed = HAS_LANDED
+        elif self._armed and (above_home_m > _FLIES_M or not self._has_flown):
+            self.stays_disarmed = ""
 
     def _carry_altitude_on(self) -> None:
         """Follow the height of the local frame while no altitude is reported: a climb towards an old one has no end."""
@@ -179,6 +179,9 @@ class AutopilotStartup(Startup):
     def is_half_way_up(self) -> bool:
         return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
 
+    def disarmed(self) -> None:
+        self.stays_disarmed, self._took_off_ns = self.stays_disarmed or WAS_DISARMED, None
+
     def begin_anew(self) -> None:
         self._accepted.clear()
         self._took_off_ns, self._restarted = None, True
@@ -197,7 +200,7 @@ class AutopilotStartup(Startup):
         # A vehicle found in the air takes set-points at once; during a take-off, they would end the climb too early.
         enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if took_off else _LEFT_GROUND_M
         is_up = self.airborne or (self.relative_altitude_m or 0.0) > enough_m
-        self.airborne = armed and is_up and not self.has_landed
+        self.airborne = armed and is_up and not self.stays_disarmed
         seen = Seen(
             interval_due=due,
             clock_known=clock_known,
@@ -206,7 +209,7 @@ class AutopilotStartup(Startup):
             origin_known=self.origin is not None,
             custom_mode=custom_mode,
             armed=armed,
-            has_landed=self.has_landed,
+            stays_disarmed=self.stays_disarmed,
             took_off=took_off,
             airborne=self.airborne,
             relative_altitude_m=self.relative_altitude_m,

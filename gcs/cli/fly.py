@@ -68,7 +68,8 @@ def fly(
 ) -> None:
     """Design the control, start the vehicles, fly and record.
 
-    Exit code 1 if the flight is not stable, its log is incomplete, or an assertion does not hold.
+    Exit code 1 if the flight is not stable, its log is incomplete, a vehicle does not confirm at the end that it holds
+    or lands, or an assertion does not hold.
     """
     from gcs.drive import fly as flying
     from gcs.drive import preflight
@@ -169,6 +170,7 @@ def _passed(summary: "Summary", least_headroom: float | None, settled_s: float |
 
     stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
     checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
+    checks.append(Check("the vehicles hold or land at the end", summary.not_confirmed))
     least, after_s, asserted = summary.headroom_min, summary.settling_time_s, list[Check]()
     if least_headroom is not None:
         unmet = options.unmet_headroom(least, least_headroom)

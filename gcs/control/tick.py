@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 CLOCK_JUMPED = "its clock jumped"
 """Text of the event that reports a clock jump."""
+NOT_CONFIRMED = "not confirmed"
+"""Kind of the event that names the vehicles that did not confirm, at the end, that they hold or land."""
 GAIN_SET = "gain set "
 """STATUSTEXT that announces a vehicle's new gain set: after the vehicle's name and before the number of the set."""
 TickArray = NDArray[Any]

@@ -14,6 +14,7 @@ from gcs.drive.udp import StationSocket, clock_ns
 from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
+from gcs.station.reception import AUTOPILOT_COMPONENT
 from scenarios.files import fingerprint
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S, Scenario
@@ -110,7 +111,7 @@ class Presence:
             for datagram in self._link.receive():
                 frames_in = mavlink.decode_either(datagram.data, Counter())
                 for frame in mavlink.in_network(frames_in, datagram.address[2]):
-                    if frame.system_id in self._wanted:
+                    if frame.system_id in self._wanted and frame.component_id == AUTOPILOT_COMPONENT:
                         self._addresses[frame.system_id] = datagram.address
                         frames.append(frame)
         return frames

@@ -42,8 +42,9 @@ class Kind:
     """It becomes guided on the ground, before it is armed; otherwise only in the air, while set-points arrive."""
     altitude_above_sea: bool = False
     """Its take-off command takes an altitude above sea level, not above home."""
-    stays_guided: bool = False
-    """Without set-points it stops but stays guided, so leaving the guided mode is always somebody's choice."""
+    failsafe_mode: int = -1
+    """The mode that it enters by itself, reporting a failsafe, when set-points stop; -1 if it stays guided. Any other
+    mode is the choice of its pilot, or of its autopilot on its own account."""
     velocity_grows: bool = False
     """Between set-points its velocity target grows with the acceleration."""
     timesync_error_ns: int = 0

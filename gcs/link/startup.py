@@ -31,8 +31,8 @@ class Startup(Protocol):
     kind: Kind
     refusal: str = ""
     """Why the vehicle must not be flown; empty if it may."""
-    has_landed: bool = False
-    """Whether it has been in the air in this flight and is back on the ground."""
+    stays_disarmed: str = ""
+    """Why the station must not arm it: it has landed, or somebody has disarmed it. Empty if it may."""
     stranger: bool = False
     """Whether the vehicle has yet to say that it is simulated; until then it is commanded nothing."""
     arming_refusals: int = 0
@@ -64,6 +64,7 @@ class Startup(Protocol):
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
+    def disarmed(self) -> None: ...  # by somebody else, as the station never does it
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
 

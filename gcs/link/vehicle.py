@@ -265,6 +265,8 @@ class RemoteVehicle:
         with an autopilot never counts as settled, because its start-up depends on time."""
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still arrive."""
+        self._unanswered_ns = 0
+        """When the last ARM or TAKE_OFF was sent whose result is unknown; 0 if there is none."""
         self._not_before_ns = 0
         self._outdated: list[tuple[int, int, bool]] = []
         """For each recent command that changed mode or arming: the time of its ACK, and mode and arming before it. A
@@ -286,12 +288,15 @@ class RemoteVehicle:
 
     @property
     def ended(self) -> bool:
-        """Whether the vehicle holds or lands, or must not be told to: it is not armed, or somebody else flies it."""
-        if self.external or self.startup.stranger:
+        """Whether the vehicle holds or lands, or must not be told to: it is not armed, or somebody else flies it.
+
+        False while the result of an ARM or TAKE_OFF is unknown.
+        """
+        if self.external or self.taken_over or self.startup.stranger:
             return True
-        if self.kind.piloted and (self.kind is UNRECOGNISED or not self.armed):
+        if self.kind.piloted and (self.kind is UNRECOGNISED or not (self.armed or self._unanswered_ns)):
             return True
-        return self.taken_over or self.custom_mode == self.end_mode
+        return self.custom_mode == self.end_mode and not self._unanswered_ns
 
     @property
     def guided(self) -> bool:
@@ -332,10 +337,12 @@ class RemoteVehicle:
 
     @property
     def missing(self) -> str:
-        """Why the vehicle is not ready, in words; empty if it is ready."""
+        """Why the vehicle is not ready or, at the end, has not ended, in words; empty if it is or has."""
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
-        if self.taken_over and not self.startup.has_landed:
+        if self.goal is Goal.END:
+            return "" if self.ended else f"does not {'land' if self._land else 'hold'}"
+        if self.taken_over and not self.startup.stays_disarmed:
             left = "left" if self.has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         return self._next_step().missing
@@ -430,19 +437,25 @@ class RemoteVehicle:
         if self.kind.piloted:
             self.clock.expected_error_ns = self.kind.timesync_error_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
+            if self.armed and not armed:
+                self.startup.disarmed()
+        if self._unanswered_ns < recent_ns:
+            self._unanswered_ns = 0
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe", self.system_id)
         elif was_guided and not self.guided and not critical:
-            self._report("vehicle", f"left {self.kind.guided_name}", self.system_id)
+            self._report("vehicle", f"left {self.kind.guided_name}" if armed else "was disarmed", self.system_id)
         self.critical = critical
         self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
-        """Detect from a reported mode that somebody else has taken the vehicle over, or handed it back.
+        """Detect from a reported mode or arming that somebody else has taken the vehicle over, or handed it back.
 
-        A mode to which no command of the station leads is somebody's choice, unless the vehicle reports a failsafe. On
-        the ground, before arming, anybody may set any mode.
+        A mode to which no command of the station leads is somebody's choice, unless the vehicle enters it when
+        set-points stop. A reported failsafe is not enough: its pilot may steer it, or it may fly home on a low battery.
+        On the ground, before arming, anybody may set any mode. Whoever arms a vehicle flies it, unless it holds: then
+        it waits for its take-off.
         """
         kind, before = self.kind, self.custom_mode
         if self.external:
@@ -450,14 +463,14 @@ class RemoteVehicle:
         if mode == kind.guided_mode:
             self.has_been_guided = True
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < FORGET_NUMBERS_NS
-        elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
+        elif self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
             return
-        elif before == kind.guided_mode:
-            self.taken_over = kind.stays_guided or not critical
         elif before < 0:
-            self.taken_over = armed and not critical and mode not in (kind.hold_mode, kind.take_off_mode)
-        elif (armed or self.armed) and not critical:
-            self.taken_over = not self._takes_off_by(mode)
+            self.taken_over = armed and mode not in (kind.hold_mode, kind.take_off_mode)
+        elif mode == before:
+            self.taken_over = armed and not (self.armed or self._unanswered_ns or mode == kind.hold_mode)
+        elif armed or self.armed or before == kind.guided_mode:
+            self.taken_over = not (self._takes_off_by(mode) or (critical and mode == kind.failsafe_mode))
         if self.taken_over:
             self._command = None  # resending it would take the vehicle back
 
@@ -483,7 +496,7 @@ class RemoteVehicle:
         if earlier == command and answers > 0 and now_ns - waiting.sent_ns < (self.clock.rtt_ns or 0):
             self._earlier = earlier, answers - 1  # too soon for an answer to this request
             return
-        self._command = None
+        self._command, self._unanswered_ns = None, 0
         self._earlier = command, waiting.confirmation
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
@@ -544,7 +557,7 @@ class RemoteVehicle:
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
             self._earlier = 0, 0  # an answer to an earlier request would have arrived
-            revocable = waiting.command == SET_MODE or self.startup.has_landed
+            revocable = waiting.command in (SET_MODE, ARM_DISARM) or self.startup.stays_disarmed
             if revocable and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None
         if waiting is None:
@@ -553,6 +566,8 @@ class RemoteVehicle:
                 return None
             waiting = self._command = _Waiting(*wanted, sent_ns=now_ns)
             self._take_off_sent = self._take_off_sent or waiting.command == TAKE_OFF
+        if waiting.command in (ARM_DISARM, TAKE_OFF):
+            self._unanswered_ns = now_ns
         return self.encode(
             mavlink.COMMAND_LONG,
             mavlink.command_long(
@@ -582,6 +597,13 @@ class RemoteVehicle:
         )
         asks = step.command is not None and step.command[0] == SET_MESSAGE_INTERVAL
         return Step(step.missing) if self.external and not asks else step
+
+    def end(self, *, alone: bool = False) -> None:
+        """Let it hold or land from now on, or leave it alone. What is not answered yet is repeated no more, but for a
+        mode: an answer does not say which mode it is to."""
+        self.goal = None if alone else Goal.END
+        if self._command is not None and self._command.command != SET_MODE:
+            self._command = None
 
     def begin_anew(self) -> None:
         """Set rates and parameters again: the vehicle seems to have restarted.

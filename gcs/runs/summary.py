@@ -14,7 +14,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.own_law import BAD, BUDGET_SHARE, CALLS, LAW, OVER
-from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray, chosen
+from gcs.control.tick import CLOCK_JUMPED, NOT_CONFIRMED, TICK, Event, Mode, TickArray, chosen
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
@@ -162,6 +162,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         reason=judged.reason,
         fleet=([event.text for event in events if event.kind == record.FLEET] or [record.STARTED])[-1],
         not_logged=judged.not_logged,
+        not_confirmed=([event.text for event in events if event.kind == NOT_CONFIRMED] or [""])[-1],
         loop=scenario.control.loop,
         prediction=scenario.control.prediction,
         delay_margin_s=design.delay_margin_s,

@@ -136,6 +136,7 @@ class Summary(Published):
     reason: str = ""
     fleet: str = STARTED
     not_logged: tuple[str, ...] = ()
+    not_confirmed: str = ""
     loop: Literal["ground", "onboard"]
     prediction: float | str = "off"
     delay_margin_s: Number

@@ -1,8 +1,8 @@
-"""Absent vehicles: lost, left out, landed, or flown by a pilot or by the autopilot on its own account."""
+"""Absent vehicles: lost, left out, disarmed, or flown by a pilot or by the autopilot on its own account."""
 
 from collections.abc import Sequence
 
-from gcs.autopilot.kinds import STAYS_DISARMED
+from gcs.autopilot.kinds import HAS_LANDED, WAS_DISARMED
 from gcs.link.vehicle import RemoteVehicle
 
 LOST, TAKEN_OVER = "is lost", "is taken over by its pilot or its autopilot"
@@ -16,13 +16,13 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
         return LEFT_OUT
     if gone:
         return LOST
-    if vehicle.startup.has_landed:
-        return STAYS_DISARMED
-    return TAKEN_OVER if vehicle.taken_over else ""
+    return vehicle.startup.stays_disarmed or (TAKEN_OVER if vehicle.taken_over else "")
 
 
-PILOTED = (TAKEN_OVER, STAYS_DISARMED)
-"""Reasons for absence of a vehicle that its pilot flies or has landed."""
+GROUNDED = (HAS_LANDED, WAS_DISARMED)
+"""Reasons for absence of a vehicle on the ground; others may fly over it."""
+PILOTED = (TAKEN_OVER, *GROUNDED)
+"""Reasons for absence of a vehicle that its pilot flies, or has landed or disarmed."""
 
 
 def describe_change(was: str, now: str) -> str:
@@ -34,7 +34,10 @@ def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
     """Why a flight ends: its duration has passed, or no vehicle is left. It names absent vehicles."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
-    kinds = (("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", STAYS_DISARMED))
+    kinds = (
+        ("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", HAS_LANDED),
+        ("disarmed", WAS_DISARMED),
+    )  # fmt: skip
     gone = {
         word: ", ".join(str(v.system_id) for v, reason in zip(vehicles, absent, strict=True) if reason == kind)
         for word, kind in kinds

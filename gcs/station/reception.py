@@ -34,7 +34,8 @@ from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
 AUTOPILOT_COMPONENT = 1
-"""Component id of the autopilot. A camera or gimbal has the vehicle's system id and sends its own heartbeats."""
+"""Component id of the autopilot. A camera, gimbal or companion has the vehicle's system id and sends its own
+heartbeats, perhaps from another port: they show neither where the autopilot is nor that it is alive."""
 ANOTHER_ADDRESS = "known system id from another address"
 _NOT_KNOWN = -2
 """Stands for the number of an address from which no vehicle sends."""
@@ -193,6 +194,11 @@ class Reception:
                 self.counters["unknown system id"] += 1
                 continue
             vehicle = self._fleet.vehicles[row]
+            if frame.component_id != AUTOPILOT_COMPONENT:
+                self.counters["other component"] += 1
+                if vehicle.address == datagram.address:
+                    self.frames.append((frame.data, datagram.received_ns, datagram.address))
+                continue
             if vehicle.address != datagram.address:
                 if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
@@ -203,9 +209,6 @@ class Reception:
             vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
             self.touched.add(row)
             self.frames.append((frame.data, datagram.received_ns, datagram.address))
-            if frame.component_id != AUTOPILOT_COMPONENT:
-                self.counters["other component"] += 1
-                continue
             if vehicle.is_replay(frame, datagram.received_ns):
                 continue
             self._handle(row, vehicle, frame, datagram, now, outgoing)
@@ -388,6 +391,7 @@ def _take_position(
         link.local[k] = state[k]
     sample_ns = sampled_ns(clock, boot_ms, received_ns, link.newest)
     if link.left_out:
+        tables.telemetry_ns[row] = received_ns
         return  # on the ground, others may fly over it
     if sample_ns == UNKNOWN:
         if not (clock.lost or clock.doubtful_state):

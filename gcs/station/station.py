@@ -17,14 +17,14 @@ from gcs.control.loop_delay import repeated_s
 from gcs.control.loops import Moment, Orders
 from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
-from gcs.control.tick import GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.control.tick import GAIN_SET, NOT_CONFIRMED, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.clocks import UNANSWERED
 from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
-from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, note_requests, set_points_to
+from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, in_words, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
+from gcs.station.absence import GROUNDED, LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
@@ -273,7 +273,7 @@ class Station:
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
         down_m = judged.reported["down_m"] if self._limits.has_slots else np.empty(0)
-        near = nearest(judged.controls, tick.due_ns, down_m)
+        near = nearest(self._off_the_ground(judged.controls), tick.due_ns, down_m)
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)
@@ -283,6 +283,14 @@ class Station:
         own_ns = at_ns[tick.set_point_indices]  # -1, for vehicles that were sent none, selects the last one
         rows, self._used_s[:] = tick_rows(tick, judged, self._fleet.links, near.distance_m, own_ns)
         return rows
+
+    def _off_the_ground(self, controls: Records) -> Records:
+        """The controls without the states of vehicles on the ground: they are not near those that fly over them."""
+        grounded = [row for row, why in enumerate(self._why_absent) if why in GROUNDED]
+        if grounded:
+            controls = controls.copy()
+            controls["state"][grounded] = nan
+        return controls
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
@@ -421,7 +429,7 @@ class Station:
         """Update the state derived from these vehicles, which may have changed."""
         for row in rows:
             vehicle = self.vehicles[row]
-            self._guided[row], self._critical[row] = vehicle.guided, vehicle.critical
+            self._guided[row], self._critical[row] = vehicle.guided and not vehicle.left_out, vehicle.critical
             self._why_absent[row] = absence(vehicle, gone=False)
             self._busy.add(row)
 
@@ -462,8 +470,9 @@ class Station:
             # A broken formation is left to its failsafe, if that holds the vehicles: the cause may be the link.
             alone = self._journal.stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
-                vehicle.goal = None if alone else Goal.END
+                vehicle.end(alone=alone)
             self._busy.update(range(len(self.vehicles)))
+        self._report_not_confirmed()
         self._report("phase", str(phase))
 
     # -- sending and reporting -------------------------------------------------------------------------------------
@@ -475,6 +484,13 @@ class Station:
         self._tell(vehicle, after, after.name, outgoing)
         if after is Mode.CRITICAL and vehicle.clock.unanswered >= UNANSWERED and np.isnan(self._used_s[row]):
             self._report("vehicle", "does not answer TIMESYNC: its loop delay is unknown", vehicle.system_id)
+
+    def _report_not_confirmed(self) -> None:
+        """After the flight, report the vehicles that were told to hold or land and have not confirmed it."""
+        told = (vehicle for vehicle in self.vehicles if vehicle.address is not None and vehicle.goal is Goal.END)
+        late = [vehicle for vehicle in told if not vehicle.ended]
+        if self.phase is Phase.ENDED and late:
+            self._report(NOT_CONFIRMED, in_words("", late))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""

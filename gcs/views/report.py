@@ -254,6 +254,8 @@ def flight_lines(summary: Summary) -> dict[str, str]:
         )
     if summary.not_logged:
         lines["not written"] = "; ".join(summary.not_logged)
+    if summary.not_confirmed:
+        lines["not confirmed"] = summary.not_confirmed
     return lines
 
 
@@ -261,6 +263,8 @@ def print_flight(summary: Summary, console: Console) -> None:
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary.verdict, "bold yellow")
     lines = flight_lines(summary)
     console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {lines['verdict']}"))
+    if summary.not_confirmed:
+        console.print(f"end      not confirmed: {summary.not_confirmed}")
     for text in summary.not_logged:
         console.print(f"log      not written: {text}")
     for name in ("delay", "alpha", "modes"):

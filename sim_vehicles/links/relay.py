@@ -15,6 +15,7 @@ from scenarios.networks import MOST_IN_NETWORK
 from sim_vehicles.links.links import LinkSet
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Recorder
 from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.mavlink import COMPONENT_AUTOPILOT
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 SETUP_SIGNING = (256).to_bytes(3, "little")
@@ -31,14 +32,17 @@ class Passing(NamedTuple):
 
 
 def sender(data: bytes) -> int | None:
-    """System id of a datagram's first frame, MAVLink 1 or 2; None if it is not a vehicle's (1 to 250)."""
+    """System id of a datagram's first frame, MAVLink 1 or 2; None if it is not a vehicle's (1 to 250).
+
+    A camera or companion with a vehicle's system id is not the vehicle.
+    """
     if len(data) >= 12 and data[0] == MAGIC_2:
-        system_id = data[5]
+        system_id, component_id = data[5:7]
     elif len(data) >= 8 and data[0] == MAGIC_1:
-        system_id = data[3]
+        system_id, component_id = data[3:5]
     else:
         return None
-    return system_id if 1 <= system_id <= MOST_IN_NETWORK else None
+    return system_id if 1 <= system_id <= MOST_IN_NETWORK and component_id == COMPONENT_AUTOPILOT else None
 
 
 def holds_key(data: bytes) -> bool:

@@ -13,8 +13,8 @@ HOME = ("127.0.0.1", 5001, 0)
 class Peer:
     """One vehicle played by pymavlink: what it says and what it was told."""
 
-    def __init__(self, system_id: int, address: Address = HOME) -> None:
-        self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
+    def __init__(self, system_id: int, address: Address = HOME, *, component: int = 1) -> None:
+        self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component)
         self.address = address
 
     def datagram(self, message: Any, time_ns: int) -> Datagram:

@@ -1,9 +1,11 @@
 """A vehicle that has been in the air and is on the ground again is never armed by the station."""
 
+import numpy as np
 import pytest
 
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.station.station import Station
+from scenarios.schema import NominalVelocity
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.flown_copters import plan_for, three
@@ -32,6 +34,20 @@ def test_a_vehicle_landed_by_its_pilot_stays_disarmed_in_guided(flavour: str) ->
     assert texts.count("has landed and is not armed again") == 1
     assert station.end_reason == "landed: vehicles 3"
     assert abs(error_m) < 0.17  # the others fly on
+
+
+def test_a_landed_vehicle_does_not_collide_with_one_above_it() -> None:
+    """The others stand still until it has landed, and then fly over it."""
+    speeds = ((0.0, 0.0), (25.0, 3.0))
+    over = tuple(NominalVelocity(from_s=at_s, velocity_ne_m_s=(-speed, speed)) for at_s, speed in speeds)
+    scenario = flown("ardupilot").model_copy(update={"duration_s": 32.0, "nominal_velocity": over})
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own = PilotsVehicle(fleet, "ardupilot", {flight_s("ardupilot") + 1.0: RULES["ardupilot"].land_mode})
+    ticks = np.concatenate([*fly_lockstep(station.plan, station=station, vehicles=own)])
+    second, third = (ticks[ticks["system_id"] == k] for k in (2, 3))
+    apart_m = np.hypot(second["north_m"] - third["north_m"], second["east_m"] - third["east_m"])
+    assert np.nanmin(apart_m) < scenario.safety.collision_distance_m
+    assert station.end_reason == "landed: vehicles 3"
 
 
 def test_refusals_to_arm_are_one_event_and_a_count() -> None:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs.control.tick import Mode
 from gcs.drive.lockstep import START_NS
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import verdict
@@ -76,6 +77,17 @@ def test_a_vehicle_that_fell_silent_climbing_is_left_alone() -> None:
     assert "is left out: is silent" in flight.texts("vehicle")
     assert LEFT_OUT in flight.texts("vehicle")
     assert flight.copter(3).mode == flight.copter(3).rules.hold_mode  # at the end it is told to hold, as the others
+
+
+def test_a_left_out_vehicle_that_is_heard_is_not_lost() -> None:
+    """It hears nothing, so that it does not arm."""
+    scenario = lacking(3, duration_s=1.0)
+    deaf = VehicleLinks(system_id=3, down=Link(delay_s=0.02, outages=(Outage(from_s=2.0, until_s=1e6),)))
+    links = scenario.links.model_copy(update={"vehicles": (deaf,)})
+    flight = fly(plan_for(scenario.model_copy(update={"links": links})))
+    assert flight.station.end_reason == "left out: vehicles 3"
+    modes = flight.flown["mode"][flight.flown["system_id"] == 3]
+    assert (modes[1:] == Mode.FAILSAFE).all()  # modes are those of the phase before, at the first tick
 
 
 def test_nobody_ready_is_no_flight() -> None:

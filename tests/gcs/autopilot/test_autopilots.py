@@ -21,7 +21,7 @@ BEFORE = Seen(
     origin_known=True,
     custom_mode=0,
     armed=False,
-    has_landed=False,
+    stays_disarmed="",
     took_off=False,
     airborne=False,
     relative_altitude_m=0.0,
@@ -107,33 +107,33 @@ def startup_that_flew() -> AutopilotStartup:
 def test_a_vehicle_on_the_ground_after_flight_has_landed(base_mode: int, status: int, *, lands: bool) -> None:
     startup = startup_that_flew()
     startup.take(33, (2000, -353632620, 1491652370, 584_100, 100, 0, 0, 0, 0))
-    assert not startup.has_landed  # low, but its motors carry it
+    assert not startup.stays_disarmed  # low, but its motors carry it
     startup.take(0, (4, 2, 3, base_mode, status, 3))
-    assert startup.has_landed == lands
+    assert bool(startup.stays_disarmed) == lands
     startup.begin_anew()  # as after a restart of its autopilot
-    assert startup.has_landed == lands
+    assert bool(startup.stays_disarmed) == lands
 
 
 def test_a_landed_vehicle_that_its_pilot_flies_again_is_flown() -> None:
     startup = startup_that_flew()
     startup.take(0, (4, 2, 3, 0, 3, 3))
     startup.take(0, (5, 2, 3, 0x80, 4, 3))
-    assert not startup.has_landed  # the altitude is from before
+    assert not startup.stays_disarmed  # the altitude is from before
     startup.take(0, (5, 2, 3, 0, 3, 3))
     startup.take(33, (2000, -353632620, 1491652370, 584_100, 100, 0, 0, 0, 0))
     startup.take(0, (5, 2, 3, 0x80, 4, 3))
-    assert startup.has_landed
+    assert startup.stays_disarmed
     startup.take(33, (3000, -353632620, 1491652370, 589_000, 5_000, 0, 0, 0, 0))
-    assert not startup.has_landed
+    assert not startup.stays_disarmed
 
 
-def test_before_its_flight_a_vehicle_is_armed_again_and_again() -> None:
+def test_a_drifting_barometer_is_no_flight() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.recognise(3, 2)
     for base_mode in (0x80, 0, 0x80, 0):
         startup.take(0, (4, 2, 3, base_mode, 3, 3))
         startup.take(33, (1000, -353632620, 1491652370, 584_400, 400, 0, 0, 0, 0))  # its barometer drifts
-    assert not startup.has_landed
+    assert not startup.stays_disarmed
 
 
 def test_repeated_refusals_to_arm_are_one_text_and_a_count() -> None:

@@ -1,5 +1,6 @@
 """A flight as a gate in CI: assertions, exit codes and JUnit XML."""
 
+import json
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -8,14 +9,17 @@ import pytest
 
 from gcs.cli.main import main
 from scenarios.files import dump, load
+from scenarios.keys.link import Link, Links, Outage, VehicleLinks
 from tests.support.paths import SCENARIOS
 
 pytestmark = pytest.mark.xdist_group("processes")  # the observer
 
 
-def fly(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str | Path) -> int | str | None:
-    file = folder / "chain3.toml"
-    file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 4.0})))
+def fly(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str | Path, links: Links | None = None
+) -> int | str | None:
+    file, scenario = folder / "chain3.toml", load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 4.0})
+    file.write_text(dump(scenario if links is None else scenario.model_copy(update={"links": links})))
     arguments = [file, "--virtual", "--json", "--out", folder / "run", *options]
     monkeypatch.setattr("sys.argv", ["gcs", "fly", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
@@ -30,7 +34,7 @@ def test_assertions_that_hold_pass(
     options = ["--assert-headroom", "0.8", "--assert-settled", "2", "--junit", junit]
     assert fly(tmp_path, monkeypatch, *options) == 0
     suite = ElementTree.parse(junit).getroot()
-    assert [suite.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["4", "0", "0", "0"]
+    assert [suite.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["5", "0", "0", "0"]
     assert capfd.readouterr().err == ""
 
 
@@ -46,6 +50,15 @@ def test_each_assertion_that_fails_is_named(
     headroom, settled = capfd.readouterr().err.splitlines()
     assert re.fullmatch(r"failed: --assert-headroom: read \d\d\.\d%, wanted at least 90%", headroom)
     assert re.fullmatch(r"failed: --assert-settled: read \d+\.\d+ s, wanted at most 0\.1 s", settled)
+
+
+def test_a_vehicle_that_does_not_confirm_the_end_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    gone = Link(outages=(Outage(from_s=3.9, until_s=60.0),))
+    assert fly(tmp_path, monkeypatch, links=Links(vehicles=(VehicleLinks(system_id=3, up=gone, down=gone),))) == 1
+    summary = json.loads(capfd.readouterr().out)
+    assert (summary["verdict"], summary["not_confirmed"]) == ("stable", "vehicle 3 is silent")
 
 
 @pytest.mark.parametrize(

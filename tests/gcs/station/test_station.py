@@ -145,6 +145,17 @@ def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     assert station.vehicles[1].address == thief.address
 
 
+def test_a_companion_takes_no_vehicles_place() -> None:
+    station, peer, companion = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666, 0), component=191)
+    vehicle = station.vehicles[1]
+    station.step([companion.heartbeat(S)], S)
+    assert (vehicle.address, vehicle.first_heard_ns) == (None, None)
+    station.step([peer.heartbeat(2 * S)], 2 * S)
+    station.step([companion.heartbeat(9 * S)], 9 * S)  # the vehicle is silent
+    assert (vehicle.address, vehicle.heard_ns) == (HOME, 2 * S)
+    assert station.counters == {"other component": 2}
+
+
 def test_only_a_heartbeat_makes_a_vehicle_known() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     station.step([peer.datagram(peer.link.local_position_ned_encode(1, 0, 0, 0, 0, 0, 0), S)], S)

@@ -41,9 +41,9 @@ def wild(seed: int = 1) -> schema.Scenario:
     return scenario(2, seed=seed).model_copy(update={"links": Links(up=WILD, down=WILD)})
 
 
-def frame(system_id: int, sequence: int = 0, *, version: int = 2) -> bytes:
+def frame(system_id: int, sequence: int = 0, *, version: int = 2, component: int = 1) -> bytes:
     """A heartbeat of an autopilot, by pymavlink."""
-    mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
+    mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component)
     mav.seq = sequence & 0xFF
     return dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(mav, force_mavlink1=version == 1)
 
@@ -64,6 +64,7 @@ def through(relay: Relay, sent: Iterable[Passing], *, every_ns: int = MS) -> lis
 def test_the_sender_is_read_from_the_header_alone() -> None:
     assert sender(frame(17)) == sender(frame(17, version=1)) == 17
     assert sender(frame(255)) is None  # a station
+    assert sender(frame(17, component=191)) is sender(frame(17, version=1, component=191)) is None  # a companion
     assert [sender(data) for data in (b"", b"\xfd", b"\xfe" * 7, b"\xfd" * 11, b"\0" * 40)] == [None] * 5
 
 
