@@ -142,7 +142,7 @@ class AutopilotStartup(Startup):
         self._judge_ground()
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None:
-            self._reported = boot_ms, self.relative_altitude_m + self._local[3]
+            self._reported = boot_ms, relative_mm * 1e-3 + self._local[3]
         if self._local is not None and not self._origin_said and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
             since_s = (boot_ms - local_ms) * 1e-3

@@ -54,6 +54,9 @@ class Startup(Protocol):
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         """Process a message from the vehicle; most do not concern the start-up."""
 
+    def disarmed(self) -> None:
+        """Note that somebody else has disarmed the vehicle; the station never does."""
+
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
         """The next step towards taking set-points."""
         ...
@@ -64,7 +67,6 @@ class Startup(Protocol):
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
-    def disarmed(self) -> None: ...  # by somebody else, as the station never does it
     def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
 

@@ -129,8 +129,8 @@ def test_decoupled_axes_have_the_margin_of_one() -> None:
 @pytest.mark.parametrize("period_s", [0.02, 0.1, 0.5])
 def test_equal_followers_in_mixed_coordinates_have_the_margin_of_one(vehicles: int, period_s: float) -> None:
     # a chain, each follower driven by the one in front: one double or triple root, which rounding spreads by its root
-    A, B, K = (np.kron(np.eye(vehicles), matrix) for matrix in FOLLOWER)
-    K += np.kron(np.eye(vehicles, k=-1), [[0.2, 0.5]])
+    A, B, own = (np.kron(np.eye(vehicles), matrix) for matrix in FOLLOWER)
+    K = own + np.kron(np.eye(vehicles, k=-1), [[0.2, 0.5]])
     mixed = np.linalg.qr(np.random.default_rng(1).standard_normal((2 * vehicles, 2 * vehicles)))[0]
     margin_s = sampled_delay_margin(mixed @ A @ mixed.T, mixed @ B, K @ mixed.T, period_s=period_s)
     assert margin_s == pytest.approx(sampled_delay_margin(*FOLLOWER, period_s=period_s), rel=1e-4)

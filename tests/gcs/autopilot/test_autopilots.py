@@ -9,6 +9,7 @@ from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Seen, kind_of, next_step
 from gcs.autopilot.startup import AutopilotStartup, between, shifted
 from gcs.control.history import StateHistory
 from gcs.link.kinds import UNRECOGNISED, Kind, commanded_mode, mode_command
+from gcs.link.vehicle import ignored
 from tests.support.fleets.flown_copters import plan_for, three
 
 ALTITUDE_M = 20.0
@@ -233,7 +234,7 @@ def test_a_restarted_vehicle_has_to_say_its_origin_again() -> None:
 
 
 def test_states_in_a_frame_of_before_a_restart_are_dropped() -> None:
-    fleet, history = AutopilotFleet(plan_for(three()), lambda *_: None), StateHistory(3)
+    fleet, history = AutopilotFleet(plan_for(three()), ignored), StateHistory(3)
     for startup in fleet.starts:
         startup.take(49, (471000000, 81000000, 400_000, 0))
     fleet.locate(history)
