@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import ceil, floor, inf, isfinite
 
 import numpy as np
@@ -291,7 +291,7 @@ def first_unstable(radius: Callable[[float], float], looks: Sequence[float], tim
         found, highest, change = (look, radii[i]), max(radii[-2:]), max(radii[-3:]) - min(radii[-3:])
         closely = i > 0 and highest > near and highest + _CHANGES * change > 1.0
         closer = _closer_looks(looks[i - 1], look, timing) if closely else []
-        for delay_s, at in [*((delay_s, radius(delay_s)) for delay_s in closer), found]:
+        for delay_s, at in chain(((delay_s, radius(delay_s)) for delay_s in closer), [found]):
             met.append((delay_s, at))
             if at >= 1.0:
                 return _edge(radius, met[-2][0], delay_s) if len(met) > 1 else 0.0

@@ -73,8 +73,7 @@ class Mirror:
         other station as its own. Requests that change the rate of the telemetry used for control are refused, because
         displays ask for only a few positions a second when they connect.
         """
-        flown = (vehicle.guided or vehicle.has_been_guided for vehicle in vehicles)
-        own = {v.wire_id: v.address if has_flown else None for v, has_flown in zip(vehicles, flown, strict=True)}
+        own = {v.wire_id: v.address if v.guided or v.has_been_guided else None for v in vehicles}
         outgoing: list[Outgoing] = []
         for frame in self._received(now_ns):
             name = mavlink.message_name(frame.msg_id)

@@ -286,11 +286,11 @@ class Station:
 
     def _off_the_ground(self, controls: Records) -> Records:
         """The controls without the states of vehicles on the ground: they are not near those that fly over them."""
-        grounded = [row for row, why in enumerate(self._why_absent) if why in GROUNDED]
-        if grounded:
-            controls = controls.copy()
-            controls["state"][grounded] = nan
-        return controls
+        if not any(self._why_absent):
+            return controls
+        kept = controls.copy()
+        kept["state"][[why in GROUNDED for why in self._why_absent]] = nan
+        return kept
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
