@@ -42,11 +42,11 @@ def stress(
     jitter: Annotated[
         str,
         typer.Option(
-            metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter, not for traces"
+            metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter; not for traces"
         ),
     ] = "",
     loss: Annotated[
-        str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; in place of bursts, too")
+        str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; replaces bursts")
     ] = "",
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     prediction: Annotated[
