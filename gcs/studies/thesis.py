@@ -70,9 +70,7 @@ def _modelling() -> Iterator[Claim]:
     start = np.zeros(CHAIN.states)
     start[CHAIN.velocity_slice(0)], start[CHAIN.spacing_slice(1)] = (5.0, -3.0), (20.0, 10.0)
     K = printed_gains()
-    _, flown = thesis_flights.fly_with_late_neighbours(
-        CHAIN, K, start, delay_s=0.0, speed_m_s=thesis_flights.SPEED_M_S, duration_s=1.0
-    )
+    _, flown = thesis_flights.fly_with_late_neighbours(K, start, delay_s=0.0, duration_s=1.0)
     # the same hold of 1 ms in the linear model: one matrix exponential per step
     generator = np.zeros((CHAIN.states + CHAIN.inputs,) * 2)
     generator[: CHAIN.states] = np.hstack([CHAIN.A, CHAIN.B])

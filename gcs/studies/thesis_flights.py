@@ -16,6 +16,7 @@ from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_plan
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.own_law import LawFormation
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.views.page import figure_of, saved
@@ -26,10 +27,11 @@ PERIOD_S = 0.02
 STEP_S = 1e-3
 """Step of the nonlinear model."""
 ALPHA = 0.93
-SPEED_M_S = 91.44  # 300 ft/s
 DELAYS_S = (0.17, 0.9, 1.1)
 CHAIN, SINGLE = FormationModel((-1, 0, 1)), FormationModel((-1, 0, 1), axes=1)
 """The source's three vehicles, on both axes and on one."""
+_IN_PLACE = LawFormation((1, 2, 3), CHAIN.predecessors, np.zeros((3, 2)), np.array([91.44, 0.0]), STEP_S)
+"""These vehicles at 300 ft/s north. The wanted spacing cancels in their errors and is taken as zero."""
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#8a6d1f")
 _FT = 0.3048
 _SHOTS = 7
@@ -49,9 +51,7 @@ def _scenario(name: str) -> Scenario:
 def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
     """Times and errors of a nonlinear flight of 20 s with the printed gains, from initial errors of our choice."""
     start = np.array([2.0, -1.0, 10.0, 5.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0])
-    return fly_with_late_neighbours(
-        CHAIN, printed_gains(), start, delay_s=delay_s, speed_m_s=SPEED_M_S, duration_s=20.0
-    )
+    return fly_with_late_neighbours(printed_gains(), start, delay_s=delay_s, duration_s=20.0)
 
 
 def nonlinear_response(delay_s: float) -> tuple[float, float]:
@@ -90,7 +90,7 @@ def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
 
 
 def fly_with_late_neighbours(
-    formation: FormationModel, K: FloatArray, start: FloatArray, *, delay_s: float, speed_m_s: float, duration_s: float
+    K: FloatArray, start: FloatArray, *, delay_s: float, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and errors e (k, states) of the source's nonlinear model with delayed data from neighbours, (5.1).
 
@@ -99,37 +99,18 @@ def fly_with_late_neighbours(
     constant at `start` (states,); the formation heads north. The model shares no code with the simulated vehicles.
     """
     steps, lag = round(duration_s / STEP_S), round(delay_s / STEP_S)
-    own = own_part(formation, K)
+    own = own_part(CHAIN, K)
     others = K - own
-    nominal = np.array([speed_m_s, 0.0])
-    state = _states(formation, start, nominal)
-    errors = np.empty((steps + 1, formation.states))
+    north_m, east_m, v_north, v_east = _IN_PLACE.states(start).T
+    state = np.stack([north_m, east_m, np.arctan2(v_east, v_north), np.hypot(v_north, v_east)], axis=1)
+    errors = np.empty((steps + 1, CHAIN.states))
     errors[0] = start
     for k in range(steps):
         u = own @ errors[k] + others @ errors[max(0, k - lag)]
         state = _rk4(state, u.reshape(-1, 2))
-        errors[k + 1] = _errors(formation, state, nominal)
+        heading, speed = state[:, 2:3], state[:, 3:]
+        errors[k + 1] = _IN_PLACE.errors(np.hstack([state[:, :2], speed * np.cos(heading), speed * np.sin(heading)]))
     return np.arange(steps + 1, dtype=np.float64) * STEP_S, errors
-
-
-def _states(formation: FormationModel, errors: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Rows (X, Y, ψ, V) with these errors; the wanted spacing cancels and is taken as zero."""
-    rows: list[FloatArray] = []
-    for i, ahead in enumerate(formation.predecessors):
-        velocity = nominal + errors[formation.velocity_slice(i)]
-        position = np.zeros(2) if ahead < 0 else rows[ahead][:2] - errors[formation.spacing_slice(i)]
-        rows.append(np.array([*position, np.arctan2(velocity[1], velocity[0]), np.hypot(*velocity)]))
-    return np.array(rows)
-
-
-def _errors(formation: FormationModel, state: FloatArray, nominal: FloatArray) -> FloatArray:
-    errors = np.empty(formation.states)
-    velocity = state[:, 3:] * np.stack([np.cos(state[:, 2]), np.sin(state[:, 2])], axis=1)
-    for i, ahead in enumerate(formation.predecessors):
-        errors[formation.velocity_slice(i)] = velocity[i] - nominal
-        if ahead >= 0:
-            errors[formation.spacing_slice(i)] = state[ahead, :2] - state[i, :2]
-    return errors
 
 
 def _rk4(state: FloatArray, u: FloatArray) -> FloatArray:
