@@ -15,8 +15,6 @@ from gcs.output import outlive_readers
 from scenarios.networks import networks_of
 
 if TYPE_CHECKING:
-    from gcs.plan.design import Design
-    from gcs.plan.flight_plan import FlightPlan
     from gcs.runs.summary_record import Summary
 
 LISTEN = "127.0.0.1:14550"
@@ -77,6 +75,7 @@ def fly(
     from gcs.plan.planner import flight_plan, with_trade_off
     from gcs.views.flight_report import leave_report
     from gcs.views.report import print_design, print_summary
+    from gcs.views.viewer import new_viewer, viewer_url
 
     outlive_readers()
     _refuse_unusable(assert_headroom, assert_settled, junit, out)
@@ -108,13 +107,13 @@ def fly(
             chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
         )
         design, plan = flight_plan(scenario, measured)
-        design, plan = _flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
+        design, plan = options.flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
         design = with_trade_off(design)
         there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:
             print_design(design)
-        viewer = None if live is None else options.live_viewer(live)
+        viewer = new_viewer() if live == "new" else live and viewer_url(*options.address("--live", live))
         folder = options.run_folder(out, scenario.name)
         options.say_if_first_flight()
         if link is None:
@@ -140,16 +139,6 @@ def fly(
     options.answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     passed = _passed(summary, assert_headroom, assert_settled, junit)
     raise typer.Exit(INTERRUPTED if summary.reason.startswith("interrupted") else 0 if passed else FAILED)
-
-
-def _flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable: bool) -> "tuple[Design, FlightPlan]":
-    """Design and plan as flown. An unstable loop is refused, or only warned about if `allow_unstable`."""
-    from gcs.drive import preflight
-
-    if (unstable := preflight.unstable_loop(plan)) is not None:
-        options.refuse_or_warn(file, unstable, allow=allow_unstable)
-        return design, preflight.without_actions(plan)
-    return options.over_own_links(file, design, plan)
 
 
 def _refuse_unusable(

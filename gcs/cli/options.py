@@ -94,13 +94,6 @@ def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> 
         show(result)
 
 
-def live_viewer(text: str) -> str:
-    """The URL of the viewer that --live names, which may be a new one."""
-    from gcs.views.viewer import new_viewer, viewer_url
-
-    return new_viewer() if text == "new" else viewer_url(*address("--live", text))
-
-
 def load_scenario(
     file: Path,
     loop: LoopPlace | None = None,
@@ -173,11 +166,18 @@ def warn(file: Path, finding: str) -> None:
     print(f"warning: {file}: {finding}", file=sys.stderr)
 
 
-def over_own_links(file: Path, design: "Design", plan: "FlightPlan") -> "tuple[Design, FlightPlan]":
-    """Design and plan with their margins over the scenario's own links; warns if these differ."""
+def flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable: bool) -> "tuple[Design, FlightPlan]":
+    """Design and plan as flown, with their margins over the scenario's own links; warns if these differ.
+
+    An unstable loop is refused, or only warned about if `allow_unstable`; its monitor then only watches.
+    """
+    from gcs.drive import preflight
     from gcs.plan import planner
     from gcs.views.console import ms_text
 
+    if (unstable := preflight.unstable_loop(plan)) is not None:
+        refuse_or_warn(file, unstable, allow=allow_unstable)
+        return design, preflight.without_actions(plan)
     design, flown = planner.over_own_links(design, plan)
     if flown is not plan:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)

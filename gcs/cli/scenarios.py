@@ -130,10 +130,7 @@ def check(
     options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
     scenario, measured = chosen_for(scenario, links_of)
     design, plan = flight_plan(scenario, measured)
-    if (unstable := preflight.unstable_loop(plan)) is not None:
-        options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    else:
-        design, plan = options.over_own_links(scenario_file, design, plan)
+    design, plan = options.flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
     found = checked(plan)
     if assert_headroom is not None and not found.response_known:
         read, wanted = "autopilots that are identified in flight", "a [response] in the scenario, which makes it known"
