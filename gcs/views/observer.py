@@ -82,18 +82,17 @@ def main() -> int:
     outlive_readers()
     os.environ.setdefault("RUST_LOG", "off")  # keeps Rerun's errors off the table; one line at the end reports them
     sys.meta_path.insert(0, _NoPandas())
-    import_recording()
+    recorder = import_recording()
     os.nice(10)  # only now, because the station waits for the imports
     ready = arguments.folder / READY_FILE
     try:
         ready.touch()
         inputs = _inputs(arguments.folder, parent)
         if inputs is not None:
-            observe(
-                arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table, viewer=arguments.viewer
-            )
-        if inputs is not None and parent.gone():
-            finish(arguments.folder)  # the station was killed, so its run is summarised here
+            recording = nullcontext() if recorder is None else recorder(arguments.folder, *inputs, arguments.viewer)
+            observe(arguments.folder, *inputs, recording, parent=parent, show_table=not arguments.no_table)
+            if parent.gone():
+                finish(arguments.folder)  # the station was killed, so its run is summarised here
     except OSError as error:  # a full disk; the flight goes on
         print(f"{arguments.folder}: {error.strerror or error}; wanted room for it, then gcs recover", file=sys.stderr)
         return 1
@@ -103,13 +102,19 @@ def main() -> int:
 
 
 def observe(
-    folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool, viewer: str | None = None
+    folder: Path,
+    scenario: Scenario,
+    design: Design,
+    recorded: "AbstractContextManager[Recording | None]",
+    *,
+    parent: Parent,
+    show_table: bool,
 ) -> None:
     """Follow the run in `folder` until it ends, a stop is requested, or the parent has died and nothing new arrives."""
     system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
     tail = RunTail(folder, len(system_ids))
     state = FlightState(scenario, design)
-    with _recording(folder, scenario, design, viewer) as recording, live_display(shown=show_table) as live:
+    with recorded as recording, live_display(shown=show_table) as live:
         display = Display(state, live, shown=show_table)
         news = table_due = send_due = time.monotonic()
         ended = False
@@ -144,7 +149,7 @@ def observe(
 def recover_run(folder: Path) -> Summary:
     """Finish the files of a run that has ended, flight.rrd among them, and return its summary."""
     finish(folder)
-    if import_recording():
+    if import_recording() is not None:
         record_run(folder)
     return leave_report(folder, finish(folder))  # again, because the summary lists the files
 
@@ -164,16 +169,16 @@ def record_run(folder: Path) -> Path:
     return folder / RECORDING_FILE
 
 
-def import_recording() -> bool:
-    """Import the slow module that writes recordings; prints one line and returns False if Rerun is not installed."""
+def import_recording() -> "type[Recording] | None":
+    """Import `Recording`, which is slow; prints one line and returns None if Rerun is not installed."""
     try:
-        import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
+        from gcs.views.recording import Recording
     except ModuleNotFoundError as error:
         if not (why := extra_wanted(error.name)):
             raise
         print(f"no {RECORDING_FILE}: {why}", file=sys.stderr)
-        return False
-    return True
+        return None
+    return Recording
 
 
 class _NoPandas:
@@ -182,17 +187,6 @@ class _NoPandas:
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
             raise ModuleNotFoundError(f"{name} is not used here", name=name)
-
-
-def _recording(
-    folder: Path, scenario: Scenario, design: Design, viewer: str | None
-) -> "AbstractContextManager[Recording | None]":
-    """The recording; None where Rerun is not installed."""
-    try:
-        from gcs.views.recording import Recording  # Rerun is slow to import
-    except ModuleNotFoundError:
-        return nullcontext()
-    return Recording(folder, scenario, design, viewer)
 
 
 def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
