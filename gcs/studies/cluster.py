@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.plan.planner import flight_plan
 from gcs.published import Published
@@ -60,10 +59,7 @@ class _Flown(NamedTuple):
 
 
 def map_on_cluster(scenario: Scenario, *, trials: int, workers: int, seconds: float) -> ClusterMap:
-    """Fly a map over link delay and jitter with one worker and with `workers`; each trial flies for `seconds`.
-
-    Raises InputError if `distributed` is not installed.
-    """
+    """Fly a map over link delay and jitter with one worker and with `workers`; each trial flies for `seconds`."""
     _, plan = flight_plan(without_solver(scenario.with_calm_monitor(), seconds))
     study, points = Study(plan), list(product(_DELAYS_S, _JITTERS_S))
     wanted: list[Trial] = []
@@ -93,10 +89,8 @@ def map_on_cluster(scenario: Scenario, *, trials: int, workers: int, seconds: fl
 
 def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
     """Fly the trials `wanted` on this many workers, after a map of the trials `unflown`, which are not flown."""
-    try:
-        from distributed import LocalCluster
-    except ImportError:
-        raise InputError("--cluster: the package distributed is not installed, wanted the extra [cluster]") from None
+    from distributed import LocalCluster
+
     make: Any = LocalCluster  # its type hints do not allow synchronous use
     # its HTTP server runs even without a dashboard; without an explicit port it takes 8787, and warns if that is in use
     http = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}

@@ -64,7 +64,7 @@ def test_last_line_names_the_page_where_no_viewer_is(
         ("mcap", "export {run} --mcap {run}/a.mcap", "the package mcap is not installed; wanted pip install"),
         ("rerun", "view {run}", "'formation-gcs[viewer]'"),
         ("rerun", "fly {scenarios}/chain3.toml --virtual --live 127.0.0.1:9 --out {run}/live --json", "[viewer]'"),
-        ("distributed", "bench {scenarios}/chain3.toml --cluster 2", "wanted the extra [cluster]"),
+        ("distributed", "bench {scenarios}/chain3.toml --cluster 2", "'formation-gcs[cluster]'"),
         ("cvxpy", "design {scenarios}/chain3_bidirectional.toml --method graph-dk", "'formation-gcs[solver]'"),
     ],
 )
