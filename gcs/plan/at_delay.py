@@ -48,16 +48,22 @@ def with_figures_at_delay(design: Design, plan: FlightPlan) -> Design:
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """α and the string peak of a design's gain set at a loop delay (s)."""
-    if delay_s is not None and design.vehicles > 1 and _is_predicted(design) and not design.margin_unknown:
-        return _predicted_at(design, delay_s, gain_set)
-    flown, chains = _flown(design, scenario, gain_set) if delay_s is not None else ([], [])
-    if delay_s is None or not flown:
-        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+    unknown = FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+    if delay_s is None or design.vehicles < 2 or design.margin_unknown:
+        return unknown
+    if _is_predicted(design):
+        followers = _predicted_followers(design, delay_s, gain_set)
+        alphas, peaks = [own.alpha_at_delay for own in followers], [own.string_peak for own in followers]
+    else:
+        flown, chains = _flown(design, scenario, gain_set)
+        alphas, peaks = [own.alpha(delay_s) for own in flown], [own.string_peak(delay_s) for own in chains]
+    if not alphas:
+        return unknown
     return FiguresAtDelay(
         loop_delay_s=delay_s,
-        alpha=min(formation.alpha(delay_s) for formation in flown),
-        has_string_verdict=bool(chains),
-        string_peak=plain(max(loop.string_peak(delay_s) for loop in chains)) if chains else None,
+        alpha=min(alphas),
+        has_string_verdict=bool(peaks),
+        string_peak=plain(max(peaks)) if peaks else None,
     )
 
 
@@ -66,15 +72,15 @@ def _is_predicted(design: Design) -> bool:
     return design.prediction is not None or design.feed_forward > 0.0
 
 
-def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDelay:
-    """The figures of a loop with prediction or feed-forward; known only for inclusion gains on the ground."""
+def _predicted_followers(design: Design, delay_s: float, gain_set: int) -> list[PredictedFigures]:
+    """The followers of a loop with prediction or feed-forward; known only for inclusion gains on the ground."""
+    if design.inclusion_gains is None or design.loop != "ground":
+        return []
     assumed_s = 0.0
     if design.prediction is not None:
         fixed_s = design.prediction.assumed_delay_s
         assumed_s = delay_s if fixed_s is None else fixed_s
-    entry = _gain_set(design, gain_set)
-    has_chain = design.inclusion_gains is not None and design.loop == "ground"
-    followers = [
+    return [
         PredictedFigures(
             PAIR,
             chain.gains.K,
@@ -85,21 +91,12 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
             response=chain.response,
             feed_forward=design.feed_forward,
         )
-        for chain in (_follower_loops(design, entry) if has_chain else [])
+        for chain in _follower_loops(design, _gain_set(design, gain_set))
     ]
-    if not followers:
-        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
-    return FiguresAtDelay(
-        loop_delay_s=delay_s,
-        alpha=min(each.alpha_at_delay for each in followers),
-        string_peak=plain(max(each.string_peak for each in followers)),
-    )
 
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
     """The formations flown, none where no α is defined, and the loops of followers in a leader-follower tree."""
-    if design.vehicles < 2 or design.margin_unknown or _is_predicted(design):
-        return [], []
     entry = _gain_set(design, gain_set)
     if design.inclusion_gains is not None:
         chains = _follower_loops(design, entry)
