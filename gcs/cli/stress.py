@@ -308,15 +308,12 @@ def _campaign(
     """Fly the sweep over the axes and, with a tolerance, search for the onset; returns the result and its folder."""
     from gcs.drive.fly import new_folder
     from gcs.plan.loops import window_of
-    from gcs.runs.record import SCENARIO_FILE, write_whole
+    from gcs.runs.files import write_scenario
     from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset
     from gcs.views.console import progress
-    from scenarios.files import dump
-    from scenarios.own_code import write_code
 
-    scenario = dump(study.plan.scenario)
     if resume:
         assert out is not None
         check_study("--resume", out / TRIALS_FILE, scenario=study.plan.scenario)
@@ -329,8 +326,7 @@ def _campaign(
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
             folder = out if resume else options.out_folder(out, _OUT_WANTED)
-        write_whole(folder / SCENARIO_FILE, scenario.encode())
-        write_code(study.plan.scenario, folder)
+        write_scenario(folder, study.plan.scenario)
         store = stack.enter_context(contextlib.closing(trials_of(folder)))
         begin = stack.enter_context(progress(shown=shown))
         try:

@@ -46,9 +46,14 @@ def write_design(folder: Path, design: Design) -> None:
     write_whole(folder / DESIGN_FILE, design.to_json().encode())
 
 
-def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
-    (folder / SCENARIO_FILE).write_text(scenario_files.dump(scenario), encoding="utf-8")
+def write_scenario(folder: Path, scenario: Scenario) -> None:
+    """Write a scenario, and the code that it names."""
+    write_whole(folder / SCENARIO_FILE, scenario_files.dump(scenario).encode())
     write_code(scenario, folder)
+
+
+def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
+    write_scenario(folder, scenario)
     write_design(folder, design)
 
 

@@ -21,11 +21,11 @@ from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.published import json_text
-from gcs.runs.record import SCENARIO_FILE, write_whole
+from gcs.runs.files import write_scenario
+from gcs.runs.record import write_whole
 from gcs.station.station import Station
 from gcs.stress.campaign import Store, check_study
 from gcs.studies.benchmark import with_vehicles
-from scenarios.files import dump
 from scenarios.schema import Scenario
 
 LOADS_FILE, RESULT_FILE = "loads.jsonl", "capacity.json"
@@ -249,7 +249,7 @@ def loads_of(folder: Path, scenario: Scenario, *, resume: bool) -> Store[Load]:
     """
     if resume:
         check_study("--resume", folder / LOADS_FILE, "capacity study", scenario)
-    write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
+    write_scenario(folder, scenario)
     return Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 
 

@@ -25,12 +25,11 @@ from gcs.drive.flown import fly_plan
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.published import json_text
-from gcs.runs.record import SCENARIO_FILE
+from gcs.runs.files import write_scenario
 from gcs.runs.summary import summarise
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
 from gcs.views.console import UNKNOWN, ms_text, number_text
 from gcs.views.page import data_uri, figure_of, rendered, saved
-from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 
 Method = Literal["inclusion", "graph-lqr", "graph-dk"]
@@ -164,7 +163,7 @@ def string_peak(model: FormationModel, K: FloatArray) -> float | None:
 def write_comparison(
     folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
 ) -> None:
-    (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
+    write_scenario(folder, scenario)
     result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
     (folder / RESULT_FILE).write_text(json_text(result, default=vars), encoding="utf-8")
     figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
