@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gcs.cli.options import answer, out_file, within
+from gcs.cli.options import answer, out_file
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ Front = Annotated[
     bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
 ]
 At = Annotated[
-    float | None, typer.Option("--at", metavar="SECONDS", help="take the gains of the front at this loop delay")
+    float | None,
+    typer.Option("--at", metavar="SECONDS", min=0.001, max=10, help="take the gains of the front at this loop delay"),
 ]
 Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: the quantity to maximise")]
 Predict = Annotated[
@@ -185,7 +186,6 @@ def scenario_at(
     """The scenario with the gains of one point of the front, by the scenario's method."""
     from gcs.studies.front import point_at
 
-    within("--at", delay_s, 0.001, 10.0, "seconds")
     own: Method = "graph-lqr" if scenario.control.method == "graph-lqr" else "inclusion"
     _refuse_graph_dk(scenario)
     aim = "alpha_at_delay" if maximise == "alpha" else "decay_rate_at_delay_1_s"

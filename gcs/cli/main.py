@@ -110,6 +110,11 @@ def _misread(error: typer.TyperException) -> str:
         return error.format_message()
     [found, *_] = error.__cause__.errors()
     option = error.param.get_error_hint().replace("'", "")
+    if found["type"] in ("greater_than_equal", "less_than_equal"):
+        low, high = (getattr(error.param, bound) for bound in ("min", "max"))
+        unit = "seconds" if error.param.metavar == "SECONDS" else "a number"
+        range_text = f"from {low:g} to {high:g}" if high is not None else f"of at least {low:g}"
+        return f"{option}: read {float(found['input']):g}, wanted {unit} {range_text}"
     wanted = found["msg"].removeprefix("Input should be ").split(", unable to")[0].split("is not ")[-1].rstrip(".")
     return f"{option}: read {found['input']!r}, wanted {wanted}"
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcs.cli import FAILED
-from gcs.cli.options import AsJson, RunFolder, answer, out_file, out_folder, within
+from gcs.cli.options import AsJson, RunFolder, answer, out_file, out_folder
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,7 +42,12 @@ def view(
     web: Annotated[bool, typer.Option("--web", help="serve it to browsers on this machine until Ctrl-C")] = False,
     at: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="scenario time of the picture; default 10, or the end if sooner"),
+        typer.Option(
+            metavar="SECONDS",
+            min=0,
+            max=1_000_000,
+            help="scenario time of the picture; default 10, or the end if sooner",
+        ),
     ] = None,
 ) -> None:
     """Open a recording in Rerun or a browser, or make a picture.
@@ -54,8 +59,6 @@ def view(
     from gcs.views.viewer import find_recording, picture_time_s, refuse_without_viewer, screenshot, serve
     from gcs.views.viewer import view as open_viewer
 
-    if at is not None:
-        within("--at", at, 0.0, 1e6, "seconds")
     if picture is not None:
         out_file("--picture", picture)
         if picture.suffix.lower() != ".png":

@@ -51,7 +51,10 @@ def new(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="the new scenario")],
     like: Annotated[str | None, typer.Option(metavar="NAME", help="copy this scenario (see gcs scenarios)")] = None,
     chain: Annotated[
-        int | None, typer.Option(metavar="N", help="N vehicles, each behind and to the right of the one in front")
+        int | None,
+        typer.Option(
+            metavar="N", min=1, max=MOST_VEHICLES, help="N vehicles, each behind and to the right of the one in front"
+        ),
     ] = None,
     columns: Annotated[str | None, typer.Option(metavar="CxN", help="C columns of N vehicles, side by side")] = None,
 ) -> None:
@@ -75,7 +78,7 @@ def new(
             raise InputError(f"--like: read {like}, wanted one of {', '.join(shipped.names())}{near}")
         text = shipped.copied(like, file.stem)
     else:
-        text = shipped.columns(file.stem, *(_shape(columns) if columns is not None else (1, _chain(chain))))
+        text = shipped.columns(file.stem, *(_shape(columns) if columns is not None else (1, chain or 3)))
     parse(text, file)
     if not file.parent.is_dir():
         raise InputError(f"{file}: read no folder {file.parent}, wanted one that exists")
@@ -84,12 +87,6 @@ def new(
     if not beside.exists():
         beside.write_bytes(shipped.SCHEMA.read_bytes())
     typer.echo(f"scenario {file}\ncheck    gcs check {file}\nfly      gcs fly {file} --virtual")
-
-
-def _chain(count: int | None) -> int:
-    if count is not None and not 1 <= count <= MOST_VEHICLES:
-        raise InputError(f"--chain: read {count}, wanted 1 to {MOST_VEHICLES} vehicles")
-    return 3 if count is None else count
 
 
 def _shape(text: str) -> tuple[int, int]:
@@ -111,7 +108,12 @@ def check(
     allow_code: options.AllowCode = False,
     assert_headroom: Annotated[
         float | None,
-        typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom expected over the links is lower"),
+        typer.Option(
+            metavar="FRACTION",
+            min=-1000,
+            max=1,
+            help="exit with code 1 if the headroom expected over the links is lower",
+        ),
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
@@ -124,7 +126,6 @@ def check(
     from gcs.drive.check import check as checked
     from gcs.plan.planner import flight_plan
 
-    options.refuse_headroom(assert_headroom)
     scenario = options.load_scenario(scenario_file, loop, links=links, link_delay_s=link_delay, allow_code=allow_code)
     options.refuse(scenario_file, preflight.bad_start(scenario))
     options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,9 +46,7 @@ def monitor(
         bool, typer.Option("--request", help="ask vehicles that send no position to do so, with SET_MESSAGE_INTERVAL")
     ] = False,
     silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays may then be lower bounds")] = False,
-    seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = float(
-        "inf"
-    ),
+    seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = inf,
     save_links: SavedLinks = None,
     as_json: options.AsJson = False,
 ) -> None:

@@ -54,7 +54,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         ("view README.md", "README.md: read a file of another kind, wanted a recording of a run (.rrd)"),
         (f"fly {CHAIN} --link-delay nan", "--link-delay: read nan, wanted seconds from 0 to 60"),
         (f"fly {CHAIN} --link-delay 150ms", "--link-delay: read '150ms', wanted a valid number"),
-        (f"bench {CHAIN} --vehicles -3", "--vehicles: read '-3', wanted greater than or equal to 0"),
+        (f"bench {CHAIN} --vehicles -3", "--vehicles: read -3, wanted a number from 0 to 1000"),
         (f"design {CHAIN} --at 1 --maximise speed", "--maximise: read 'speed', wanted one of 'alpha', 'decay'"),
         (
             f"stress {CHAIN} --onset --out /proc/x",

@@ -117,10 +117,10 @@ def test_check_says_between_which_delays_a_predicted_loop_is_stable(
     [
         ("fly chain3 --virtual --listen 127.0.0.1:0", "read --virtual and --listen, wanted one of them"),
         ("fly chain3 --speed 2", "read --speed without --virtual, wanted both"),
-        ("fly chain3 --virtual --speed 0", "--speed: read 0, wanted a multiple of real time from 0.01"),
+        ("fly chain3 --virtual --speed 0", "--speed: read 0, wanted a number from 0.01 to 1e+06"),
         ("new mine.txt", "read mine.txt, wanted a file name that ends in .toml"),
         ("new there.toml", "there.toml: read a file that exists, wanted a new one"),
-        ("new mine.toml --chain 0", "--chain: read 0, wanted 1 to 1000 vehicles"),
+        ("new mine.toml --chain 0", "--chain: read 0, wanted a number from 1 to 1000"),
         ("new mine.toml --columns 40x40", "--columns: read '40x40', wanted columns and vehicles in each, such as 3x4"),
         ("new mine.toml --columns ax4", "--columns: read 'ax4', wanted"),
         ("new missing/n.toml", "missing/n.toml: read no folder missing, wanted one that exists"),
