@@ -7,7 +7,7 @@ terminal, and `Display` chooses between the two.
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import groupby
 
 import numpy as np
@@ -94,11 +94,8 @@ class FlightState:
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
 
     def redesigned(self, design: Design) -> None:
-        self._design = design
-        self._at_delay: dict[tuple[int, int], str] = {}
-        self.margin_unknown = design.margin_unknown
-        self.margin_s = np.nan if design.delay_margin_s is None else design.delay_margin_s
-        """Delay margin of the fastest gains."""
+        self.design = design
+        self._figures_at = cache(partial(figures_at, design, self.scenario))
 
     def at_delay(self, figures: "Figures") -> str:
         """In words, α and the growth of spacing errors at the largest median loop delay, rounded to the millisecond.
@@ -108,13 +105,10 @@ class FlightState:
         delay_s = _worst(figures.loop_delay_s_p50)
         if not delay_s <= PREDICTION_MAX_S:
             return ""
-        key = round(1e3 * delay_s), figures.gain_set
-        if key not in self._at_delay:
-            found = figures_at(self._design, self.scenario, key[0] / 1e3, figures.gain_set)
-            grows = f", errors {growth_text(found.string_peak)}" if found.has_string_verdict else ""
-            text = "" if found.alpha is None else f"alpha {found.alpha:.3f}{grows} at {key[0]} ms"
-            self._at_delay[key] = text
-        return self._at_delay[key]
+        delay_ms = round(1e3 * delay_s)
+        found = self._figures_at(delay_ms / 1e3, figures.gain_set)
+        grows = f", errors {growth_text(found.string_peak)}" if found.has_string_verdict else ""
+        return "" if found.alpha is None else f"alpha {found.alpha:.3f}{grows} at {delay_ms} ms"
 
     def add(self, ticks: TickArray, events: list[Event]) -> None:
         """Update the state with whole ticks, shape (ticks, vehicles), and events."""
@@ -201,8 +195,8 @@ def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    margin = f"{ms_text(state.margin_s, '.0f', unit='')} ms ({loop} loop, fastest gains)"
-    line.append(f"   delay margin {'unknown' if state.margin_unknown else margin}", style="dim")
+    margin = f"{ms_text(state.design.delay_margin_s, '.0f', unit='')} ms ({loop} loop, fastest gains)"
+    line.append(f"   delay margin {'unknown' if state.design.margin_unknown else margin}", style="dim")
     line.no_wrap = True
     return line
 
