@@ -15,7 +15,7 @@ from gains.performance.response import Response, sampled_margin
 from gains.sampled.multirate import Timing
 from gains.sampled.onboard import OnboardTiming
 from gcs.plan.formation import Formation
-from gcs.plan.mismatch import TABULATED_S, Predicted, Tabulated, Tolerated, distances, window
+from gcs.plan.mismatch import TABULATED_S, Predicted, Tolerated, distances, tabulated, window
 from scenarios.schema import Scenario
 
 Found = TypeVar("Found")
@@ -85,7 +85,7 @@ class FlightPlan:
 
         every = [self.predicted(K) for K in self.gains]
         if isinstance(prediction, str):
-            return Tabulated([[window(own, at_s) for at_s in TABULATED_S] for own in every])
+            return tabulated([[window(own, at_s) for at_s in TABULATED_S] for own in every])
         ends = [distances(window(own, prediction), prediction) for own in every]
         fixed = Tolerated(tuple(shorter for shorter, _ in ends), tuple(longer for _, longer in ends))
         return lambda _: fixed

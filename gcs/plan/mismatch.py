@@ -4,8 +4,8 @@ Without prediction the assumed delay is 0, and the loop delay may exceed it by t
 loop delay may be anywhere in the mismatch window (`gains.sampled.prediction`).
 """
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from math import inf
 from typing import NamedTuple
 
@@ -58,35 +58,32 @@ class Tolerated(NamedTuple):
         return used_s(self.shorter_s[gain_set], self.longer_s[gain_set], mismatch_s)
 
 
-class Tabulated:
+def tabulated(windows: Sequence[Sequence[Window]]) -> Callable[[float], Tolerated]:
     """The tolerance at any assumed delay, interpolated between tabulated windows; the delay is rounded to 1 ms.
 
-    Interpolation is of the reciprocals of the distances, because they are nearly linear: about k1 + k3 tau^. If only
-    one of two neighbouring windows has a lower end, its distance is used.
+    `windows` holds, for each gain set, the window at each assumed delay in `TABULATED_S`. Interpolation is of the
+    reciprocals of the distances, because they are nearly linear: about k1 + k3 tau^. If only one of two neighbouring
+    windows has a lower end, its distance is used.
     """
+    with np.errstate(divide="ignore"):
+        reciprocal = 1.0 / np.array(
+            [[distances(at, s) for at, s in zip(own, TABULATED_S, strict=True)] for own in windows]
+        )
 
-    def __init__(self, windows: Sequence[Sequence[Window]]) -> None:
-        """`windows`: for each gain set, the window at each assumed delay in `TABULATED_S`."""
-        self._known: dict[int, Tolerated] = {}
+    @cache
+    def tolerated(assumed_ms: int) -> Tolerated:
+        place = float(np.interp(1e-3 * assumed_ms, TABULATED_S, np.arange(len(TABULATED_S))))
+        before, after = reciprocal[:, int(place)], reciprocal[:, -(-int(1e9 * place) // 10**9)]
+        share = place - int(place)
+        mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
+        # a reciprocal is infinite where nothing is tolerated; times a share of 0 it would be NaN
+        between = before if share == 0.0 else (1.0 - share) * before + share * after
+        mixed = np.where(mixed > 0.0, mixed, between)
         with np.errstate(divide="ignore"):
-            self._reciprocal = 1.0 / np.array(
-                [[distances(at, s) for at, s in zip(own, TABULATED_S, strict=True)] for own in windows]
-            )
+            shorter_s, longer_s = (tuple(side) for side in (1.0 / mixed).T.tolist())
+        return Tolerated(shorter_s, longer_s)
 
-    def __call__(self, assumed_s: float) -> Tolerated:
-        key = round(1e3 * assumed_s)
-        if key not in self._known:
-            place = float(np.interp(1e-3 * key, TABULATED_S, np.arange(len(TABULATED_S))))
-            before, after = self._reciprocal[:, int(place)], self._reciprocal[:, -(-int(1e9 * place) // 10**9)]
-            share = place - int(place)
-            mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
-            # a reciprocal is infinite where nothing is tolerated; times a share of 0 it would be NaN
-            between = before if share == 0.0 else (1.0 - share) * before + share * after
-            mixed = np.where(mixed > 0.0, mixed, between)
-            with np.errstate(divide="ignore"):
-                shorter_s, longer_s = (tuple(side) for side in (1.0 / mixed).T.tolist())
-            self._known[key] = Tolerated(shorter_s, longer_s)
-        return self._known[key]
+    return lambda assumed_s: tolerated(round(1e3 * assumed_s))
 
 
 def distances(window: Window, assumed_s: float) -> tuple[float, float]:
