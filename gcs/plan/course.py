@@ -103,9 +103,12 @@ class PlannedMotion:
         """Places relative to the leader at a time, (n, 2)."""
         return np.array([self.reference(row, time_s).place_m for row in range(len(self._spans[0].before))])
 
-    def changes(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """The time of each formation change, with the places (n, 2) before and after it in the frame of the offsets."""
-        return [(span.from_s, _array(span.before), _array(span.after)) for span in self._spans[1:]]
+    def changes(self) -> list[tuple[float, float, FloatArray, FloatArray]]:
+        """The start and each formation change: its time and duration, and the places (n, 2) before and after it.
+
+        The places are in the frame of the offsets.
+        """
+        return [(span.from_s, span.duration_s, _array(span.before), _array(span.after)) for span in self._spans]
 
     def largest(self, row: int) -> Largest:
         """The extremes at the start and over every change, sampled densely; between changes the motion is steady."""
@@ -163,12 +166,8 @@ def nearest_planned(scenario: Scenario) -> Nearest | None:
     formation = plan_formation(scenario)
     motion = PlannedMotion(scenario, formation)
     altitudes = [scenario.altitude_of(vehicle) for vehicle in scenario.leader_first()]
-    ids, start = formation.system_ids, motion.places_ne_m(0.0)
-    parts = [(0.0, 0.0, start, start)]
-    changes = zip(scenario.formation_changes, motion.changes(), strict=True)
-    parts += [(entry.at_s, entry.duration_s, before, after) for entry, (_, before, after) in changes]
-    found: list[Nearest] = []
-    for from_s, duration_s, before, after in parts:
+    ids, found = formation.system_ids, list[Nearest]()
+    for from_s, duration_s, before, after in motion.changes():
         if from_s > scenario.duration_s:
             break
         for i, k in combinations(range(len(ids)), 2):
