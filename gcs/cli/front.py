@@ -1,4 +1,4 @@
-"""The options `--front` and `--at` of `gcs design`, and `--links-of`, with their printed output."""
+"""What `--front`, `--at` and `--links-of` of `gcs design` do, and what they print."""
 
 import os
 from pathlib import Path
@@ -26,26 +26,6 @@ LinksOf = Annotated[
         metavar="RUN|FILE.tlog",
         help="choose gains for the links measured in this run or log; the scenario keeps its own links",
     ),
-]
-Front = Annotated[
-    bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
-]
-At = Annotated[
-    float | None,
-    typer.Option("--at", metavar="SECONDS", min=0.001, max=10, help="take the gains of the front at this loop delay"),
-]
-Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: the quantity to maximise")]
-Predict = Annotated[
-    Literal["on", "off"] | None, typer.Option(help="with --at: predict over that delay or not; default the better")
-]
-ComparePrediction = Annotated[
-    bool,
-    typer.Option("--compare-prediction", help="show the loop delay tolerated with prediction, and its cost"),
-]
-Picture = Annotated[Path | None, typer.Option(metavar="FILE.svg|png", help="with --front: draw it into this file")]
-Save = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.toml", help="with --at or --links-of: write the scenario with these gains"),
 ]
 
 # whose gains a comparison uses

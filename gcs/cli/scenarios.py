@@ -233,14 +233,29 @@ def design(
     ] = None,
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
-    front: fronts.Front = False,
-    at: fronts.At = None,
-    maximise: fronts.Maximise = "alpha",
-    predict: fronts.Predict = None,
+    front: Annotated[
+        bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
+    ] = False,
+    at: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", min=0.001, max=10, help="take the gains of the front at this loop delay"),
+    ] = None,
+    maximise: Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: the quantity to maximise")] = "alpha",
+    predict: Annotated[
+        Literal["on", "off"] | None, typer.Option(help="with --at: predict over that delay or not; default the better")
+    ] = None,
     links_of: fronts.LinksOf = None,
-    compare_prediction: fronts.ComparePrediction = False,
-    picture: fronts.Picture = None,
-    save: fronts.Save = None,
+    compare_prediction: Annotated[
+        bool,
+        typer.Option("--compare-prediction", help="show the loop delay tolerated with prediction, and its cost"),
+    ] = False,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE.svg|png", help="with --front: draw it into this file")
+    ] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="with --at or --links-of: write the scenario with these gains"),
+    ] = None,
     allow_unstable: options.AllowUnstable = False,
     allow_code: options.AllowCode = False,
     as_json: options.AsJson = False,
