@@ -112,8 +112,8 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
         most=1.0,
     )
     both_ms = [*lines(delay_ms), *lines(margin_ms, dashed=True)]
-    delays = chart(time_s, both_ms, title="loop delay and delay margin over time", unit="ms", least=0.0)
-    errors = chart(time_s, lines(error_m), title="spacing errors over time", unit="m", least=0.0)
+    delays = chart(time_s, both_ms, title="loop delay and delay margin over time", unit="ms")
+    errors = chart(time_s, lines(error_m), title="spacing errors over time", unit="m")
     reached = "At 0 the loop delay has reached the margin of the gains that are flown."
     solid = "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; "
     return [

@@ -36,7 +36,7 @@ class Level:
 
     value: float
     label: str
-    colour: str = "#b3261e"
+    colour: str
 
 
 def chart(
@@ -46,21 +46,19 @@ def chart(
     title: str,
     unit: str,
     levels: Sequence[Level] = (),
-    least: float | None = None,
+    least: float = 0.0,
     most: float | None = None,
 ) -> str:
     """A chart of lines over the whole of `time_s` (k,), in s, ascending.
 
-    The axis of values spans `least` to `most`; None takes the extreme of lines and levels. Both are rounded outwards.
+    The axis of values spans `least` to `most`; None takes the largest value of the lines. Both are rounded outwards.
     """
-    known = [line.values[np.isfinite(line.values)] for line in lines]
-    values = np.concatenate([*known, [level.value for level in levels]]) if known or levels else np.zeros(1)
-    values = values if values.size else np.zeros(1)
-    low, high = (float(values.min()) if least is None else least), (float(values.max()) if most is None else most)
-    high = high if high > low else low + 1.0
-    marks = _ticks(low, high)
-    low, high = min(low, marks[0]), max(high, marks[-1])
-    start_s, end_s = (float(time_s[0]), float(time_s[-1])) if time_s.size else (0.0, 1.0)
+    if most is None:
+        values = np.concatenate([line.values for line in lines])
+        most = float(values[np.isfinite(values)].max(initial=least))
+    marks = _ticks(least, most if most > least else least + 1.0)
+    low, high = min(least, marks[0]), max(most, marks[-1])
+    start_s, end_s = float(time_s[0]), float(time_s[-1])
     end_s = end_s if end_s > start_s else start_s + 1.0
 
     def x(at_s: float) -> float:
