@@ -1,8 +1,9 @@
 """Kernels: functions that run for every frame of every vehicle, compiled by Numba, and the records they work on.
 
 A kernel works on numpy arrays of records, one for each vehicle, and gives the same bits as Python would. It is compiled
-at its first call, and cached on disk for later processes. The cache is valid until the kernel's file or a kernel,
-number or tuple that it uses changes. Numba is not even imported before the first call: most commands fly nothing.
+at its first call, and cached on disk for later processes and for other copies of the source. The cache is valid until
+the kernel's file or a kernel, number or tuple that it uses changes. Numba is not even imported before the first call:
+most commands fly nothing.
 """
 
 import hashlib
@@ -93,13 +94,14 @@ class _Kernel:
 
         settings: Any = config
         compiler: Any = numba
-        folder, before = _cache(settings.CACHE_DIR), settings.CACHE_DIR
+        folder, before = _cache(settings.CACHE_DIR), (settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES)
         # a cache folder for each state of the source: Numba's own index does not see what a kernel calls
         settings.CACHE_DIR = (
             ""
             if folder is None
             else str(folder / f"{self._stamp}-{settings.BOUNDSCHECK}{self._makes_arrays:d}{for_python:d}")
         )
+        settings.CACHE_LOCATOR_CLASSES = "scenarios.kernel_cache.AnyClone"
         try:
             return compiler.njit(
                 cache=folder is not None,
@@ -108,7 +110,7 @@ class _Kernel:
                 no_cpython_wrapper=not for_python,
             )(self._function)
         finally:
-            settings.CACHE_DIR = before
+            settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
 
     def _called(self) -> "list[_Kernel]":
         names, known = self._function.__code__.co_names, self._function.__globals__

@@ -4,6 +4,8 @@ import gc
 import pkgutil
 from collections.abc import Iterator
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
@@ -59,3 +61,30 @@ def right(n: int) -> int:
 @pytest.mark.parametrize(("caller", "lost"), [(wrong, 1), (right, 0), (size_of_zeros, 0)])
 def test_a_kernel_that_would_lose_arrays_is_found(caller: Any, lost: int) -> None:
     assert len([*lost_arrays(caller)]) == lost
+
+
+def loaded(file: Path) -> Any:
+    spec = spec_from_file_location("square", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_what_one_copy_of_the_source_compiled_no_other_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from numba.core import config
+
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    text = "from scenarios.kernel import kernel\n\n\n@kernel\ndef square(n: int) -> int:\n    return n * n\n"
+    known: list[int] = []
+    for name, source in (("first", text), ("second", text), ("changed", text.replace("n * n", "n * n + 1"))):
+        (tmp_path / name).mkdir()
+        file = tmp_path / name / "square.py"
+        file.write_text(source, encoding="utf-8")
+        square = loaded(file).square
+        assert square(3) == 9 + (name == "changed")
+        known.append(sum(square._compiled.stats.cache_hits.values()))
+    assert known == [0, 1, 0]
