@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,20 @@ from tests.support.fleets.pilots import PilotsVehicle
 from tests.support.sim_client import command, parse
 from tests.support.station_peer import HOME, Peer, messages
 
+shared = pytest.mark.xdist_group("copters")  # tests that look at the same flights
 PERIOD_S = 0.02
 
 
+@cache
+def usual(flavour: str) -> Flight:
+    """A flight in which nothing happens, for tests that only look at it."""
+    return fly(planned(flavour))
+
+
+@shared
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) -> None:
-    flight = fly(planned(flavour))
+    flight = usual(flavour)
     assert flight.station.end_reason == "completed: duration reached"
     for system_id in (2, 3):
         error_m = flight.error_m(system_id)
@@ -44,14 +53,16 @@ def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) ->
         assert copter.motion.altitude_m == pytest.approx(20.0, abs=0.3)
 
 
+@shared
 def test_the_announced_time_of_a_sweep_has_the_take_off() -> None:
-    flight = fly(planned("ardupilot"))
+    flight = usual("ardupilot")
     start_s = flight.flown["due_ns"].min() * 1e-9 - START_NS * 1e-9
     assert start_and_speed(planned("ardupilot"), seconds=1.0)[0] == pytest.approx(start_s, abs=0.1)
 
 
+@shared
 def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
-    flight = fly(planned("ardupilot"))
+    flight = usual("ardupilot")
     # the last positions in the scenario's frame, braking by then in the same way
     place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
     assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are said to 11 mm
@@ -60,9 +71,10 @@ def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
     assert place[3] - place[2] == pytest.approx([-12.0, 12.0], abs=0.05)
 
 
+@shared
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_the_identified_response_is_true_and_its_margin_is_used(flavour: str) -> None:
-    flight = fly(planned(flavour))
+    flight = usual(flavour)
     responses = flight.station.plan.responses
     assert responses is not None
     assert responses.source == "identified"
@@ -86,9 +98,10 @@ def test_a_given_response_skips_the_manoeuvre_as_the_design_says() -> None:
     assert at_once_s > 0.6 + TRUTH.lag_s / 2
 
 
+@shared
 def test_design_of_a_flight_names_what_was_identified() -> None:
     design, _ = flight_plan(three())
-    flight = fly(planned("ardupilot"))
+    flight = usual("ardupilot")
     known = described(design, flight.station.plan)
     assert known.margins_s == flight.station.plan.margins_s
     assert known.margins_s[0] < design.margins_s[0]
@@ -121,9 +134,10 @@ def at_loop_delay(plan: FlightPlan, delay_s: float) -> Flight:
     return fly(replace(plan, scenario=scenario.model_copy(update={"monitor": watching, "duration_s": 60.0})))
 
 
+@shared
 def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
     without_s = planned("ardupilot").delay_margin_s
-    with_s = fly(planned("ardupilot")).station.plan.delay_margin_s
+    with_s = usual("ardupilot").station.plan.delay_margin_s
     assert with_s < 0.8 * without_s
     plan = planned("ardupilot")
     assert settled(at_loop_delay(plan, 0.9 * with_s))
