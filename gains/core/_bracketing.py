@@ -26,7 +26,8 @@ _FALSE_POSITIONS = 30
 
 def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
     """Abscissae of the maxima of functions that each have one maximum in [a, b], by golden section."""
-    c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
+    c: FloatArray = a + _GOLDEN * (b - a)
+    d: FloatArray = b - _GOLDEN * (b - a)
     at_c, at_d = function(c), function(d)
     for _ in range(_GOLDEN_STEPS):
         to_left = at_c > at_d
@@ -81,7 +82,7 @@ def bracketed_roots(function: Functions, a: FloatArray, b: FloatArray, fa: Float
     """
     a, b, fa, fb = a.copy(), b.copy(), fa.copy(), fb.copy()
     c, fc = a.copy(), fa.copy()
-    fraction = np.full(a.size, 0.5)
+    fraction: FloatArray = np.full(a.size, 0.5)
     # 100 halvings exhaust any bracket of doubles; interpolation needs about 6
     for _ in range(100):
         x = a + fraction * (b - a)
@@ -96,7 +97,8 @@ def bracketed_roots(function: Functions, a: FloatArray, b: FloatArray, fa: Float
         if bool(np.all((width <= 2.0 * tolerance) | (fa == 0.0))):
             break
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+            xi: FloatArray = (a - b) / (c - b)
+            phi: FloatArray = (fa - fb) / (fc - fb)
             safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
             quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
         fraction = np.where(safe & np.isfinite(quadratic), quadratic, 0.5)

@@ -157,7 +157,9 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])
     still = min(0.5 * highest, slowest / (4.0 * parts.size * (1.0 + float(parts.known_s @ parts.norms))))
     # with a root at zero, the determinant is real up to the least frequency, and below it only rounding
-    omega = parts.frequencies(highest, _COUNT_TURN, _COUNT_GRID)
+    omega: FloatArray = parts.frequencies(highest, _COUNT_TURN, _COUNT_GRID)
+    phase: FloatArray
+    slope: FloatArray
     omega = omega[omega > (_LEAST_FREQUENCY * highest if at_zero else still)]
     near = np.outer(np.array(beside), np.concatenate([1.0 - _BESIDE, [1.0], 1.0 + _BESIDE])).ravel()
     omega = np.union1d(omega, near[(near > omega.min(initial=np.inf)) & (near < omega.max(initial=0.0))])

@@ -124,8 +124,9 @@ class Flown:
         whole = np.zeros((len(responses), n + 2, n + 2))
         for k, (A, B) in enumerate(dynamics):
             whole[k, :n, :n], whole[k, :n, n + 1 :], whole[k, n, 0] = A, B, 1.0
-        whole = expm(whole * h)
-        power, answers = whole[:, : n + 1, : n + 1], whole[:, : n + 1, n + 1 :]
+        whole = np.asarray(expm(whole * h), dtype=np.float64)
+        power: FloatArray = whole[:, : n + 1, : n + 1]
+        answers: FloatArray = whole[:, : n + 1, n + 1 :]
         while answers.shape[2] < m:
             answers = np.concatenate([answers, power @ answers], axis=2)
             power = power @ power
@@ -135,7 +136,7 @@ class Flown:
         at_ticks = np.zeros((len(responses), 2, m + 1))
         at_ticks[:, :, 1:] = np.fft.irfft(spectrum, size)[:, :, :m]
         index = np.minimum((self.sample_s / h).astype(np.int64), m - 1)
-        s = self.sample_s / h - index
+        s: FloatArray = self.sample_s / h - index
         (a0, v0), (a1, v1) = (at_ticks[:, :, index + k].swapaxes(0, 1) for k in (0, 1))
         return (
             v0 * (1.0 + 2.0 * s) * (1.0 - s) ** 2
