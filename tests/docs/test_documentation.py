@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from docs.generate import blocks, measurements, reference
-from docs.generate.keys import schema
+from docs.generate.keys import keys_page, schema
 from docs.generate.measurements import FIGURES
 from docs.generate.reference import described, found_fields
 from docs.generate.runner import CommandError, Runner
@@ -258,3 +258,19 @@ def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as Markdown renderers make them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
+
+
+@pytest.mark.parametrize(
+    ("key", "unit", "value"),
+    [
+        ("jerk_max_m_s3", "m/s³", "number"),
+        ("drag_1_m", "1/m", "number"),
+        ("spacing_gain_max_s2", "s²", "number"),
+        ("wind_ne_m_s2", "m/s², north and east", "2 numbers"),
+        ("queue_bytes", "bytes", "whole number"),
+        ("waypoints_ne_m", "m, north and east", "rows of 2 numbers"),
+        ("gain", "", "2 rows of numbers"),
+    ],
+)
+def test_keys_are_listed_with_their_unit_and_kind_of_value(key: str, unit: str, value: str) -> None:
+    assert f"| `{key}` | {unit} | {value} |" in keys_page()
