@@ -133,7 +133,7 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     designs = (with_bounds(with_spread(with_trade_off(design), plan), plan.scenario) for design, plan in planned)
     link = LinkPart(
         source="runs/log", vehicles=(1,), loop_delay_s_least=0.1, loop_delay_s_p50=0.2, loop_delay_s_worst=0.3,
-        headroom=0.3, maximised="alpha", chosen="", candidates=(GainsAtDelay(prediction=True),),
+        headroom=0.3, lost_share=0.2, maximised="alpha", chosen="", candidates=(GainsAtDelay(prediction=True),),
     )  # fmt: skip
     found = [found_fields(design.to_dict(), known) for design in (*designs, Design(delay_margin_s=1.0, for_link=link))]
     assert set[str]().union(*found) == known.keys()
