@@ -15,15 +15,20 @@ from scenarios.schema import Scenario
 
 SCHEMA_FILE = ROOT / "scenarios" / "scenario.schema.json"
 _UNITS = {  # by the end of the key's name, the longest first
+    "_ne_m_s2": "m/s², north and east",
     "_ne_m_s": "m/s, north and east",
     "_ne_m": "m, north and east",
     "_rad_s": "rad/s",
     "_bit_s": "bit/s",
+    "_m_s3": "m/s³",
     "_m_s2": "m/s²",
+    "_bytes": "bytes",
     "_m_s": "m/s",
     "_1_s": "1/s",
+    "_1_m": "1/m",
     "_ppm": "ppm",
     "_hz": "Hz",
+    "_s2": "s²",
     "_m": "m",
     "_s": "s",
 }
@@ -151,7 +156,9 @@ def _values(node: Node, what: str) -> str:
     if node["type"] == "array":
         inner = node.get("items") or node["prefixItems"][0]
         count = node.get("minItems") if "prefixItems" in node else None
-        return f"{count or 'list of'} {_values(inner, 'one')}s" if inner["type"] != "array" else f"{count} rows"
+        if inner["type"] == "array":
+            return f"{f'{count} ' if count else ''}rows of {_values(inner, 'one').removeprefix('list of ')}"
+        return f"{count or 'list of'} {_values(inner, 'one')}s"
     return {"number": "number", "integer": "whole number", "boolean": "true, false", "string": "text"}[node["type"]]
 
 

@@ -69,7 +69,7 @@ class AutopilotFleet(Fleet):
         patience_ns = self.plan.scenario.safety.ready_patience_s * NS_PER_S
 
         def late(vehicle: RemoteVehicle) -> bool:
-            first_ns = start_ns if vehicle.first_heard_ns is None else vehicle.first_heard_ns
+            first_ns = max(start_ns, vehicle.first_heard_ns or 0)  # what is heard first may wait long in the socket
             heard_ns = vehicle.heard_ns if vehicle.silent else first_ns
             return not vehicle.ready and (out_of_time or due_ns - heard_ns > patience_ns)
 

@@ -71,7 +71,11 @@ def print_result(result: CampaignResult, folder: Path) -> None:
             f"{onset.critical} waits {_ms(onset.waiting_s)} for {onset.waits_for}{breaks}"
         )
     found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
-    reasons = (found, result.onset_missing), ("of shorter delays not found", result.onset_shorter_missing)
+    reasons = (
+        (found, result.onset_missing),
+        ("of shorter delays not found", result.onset_shorter_missing),
+        ("contradicted", result.onset_contradicted),
+    )
     for found, why in (each for each in reasons if each[1]):
         console.print(f"onset    {found}: {why}")
     if result.curve_error is not None:
@@ -195,7 +199,8 @@ def print_disturbances(result: DisturbanceResult) -> None:
     console.print(table_of(result.onsets, columns, title=title))
     console.print("dynamic: any stable filter, alpha is its radius; constant: a matrix, the same north and east")
     for onset in (onset for onset in result.onsets if onset.missing):
-        console.print(f"onset    {errors_of(onset)}, {onset.kind}, not found: {onset.missing}")
+        found = "none, by prediction alone" if onset.radius_1_s is None else "not found"
+        console.print(f"onset    {errors_of(onset)}, {onset.kind}, {found}: {onset.missing}")
     if result.failure:
         console.print(f"failed   {result.failure}")
 

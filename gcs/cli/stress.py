@@ -4,6 +4,7 @@ The work is done in `gcs.stress`; the output is in `gcs.cli.results`.
 """
 
 import contextlib
+import json
 import os
 from dataclasses import replace
 from functools import partial
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcs.cli import FAILED, options
-from gcs.errors import InputError
+from gcs.errors import InputError, usable
 from gcs.interrupts import raised
 from gcs.output import outlive_readers
 
@@ -104,8 +105,8 @@ def stress(
 
     Simulated autopilots fly in virtual time. Their response is identified first, and the margin takes it into account.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, no onset with
-    --disturbance was measured, or a trial flown again differs.
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, disturbances are
+    predicted to break the formation but no onset with --disturbance was measured, or a trial flown again differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]
@@ -317,6 +318,7 @@ def _campaign(
     if resume:
         assert out is not None
         check_study("--resume", out / TRIALS_FILE, scenario=study.plan.scenario)
+        _keep_onset(out, vehicle, searches=tolerance is not None)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
     onset_shorter: Onset | NoOnset | None = None
@@ -350,6 +352,19 @@ def _campaign(
     if why := write_report(folder, result, study=study, axes=axes):
         typer.echo(f"no figures: {why}", err=True)
     return result, folder
+
+
+def _keep_onset(folder: Path, vehicle: int | None, *, searches: bool) -> None:
+    """Refuse to replace the onset in a campaign's folder by that of other links, or by none."""
+    from gcs.stress.report import RESULT_FILE
+
+    file = folder / RESULT_FILE
+    with usable(file, "the result of a campaign"):
+        onset = json.loads(file.read_bytes())["onset"] if file.is_file() else None
+    if onset is None or (searches and onset["vehicle"] == vehicle):
+        return
+    known = "--onset" if onset["vehicle"] is None else f"--onset-of {onset['vehicle']}"
+    raise InputError(f"--resume: {file} holds the onset of {known}, wanted {known} again, or a folder of its own")
 
 
 def _onset_or_why(

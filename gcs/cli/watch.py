@@ -64,7 +64,8 @@ def monitor(
     An ArduPilot sends no position until asked. --request asks each vehicle for LOCAL_POSITION_NED, at the telemetry
     rate of the scenario or 10 a second; a vehicle that obeys another station may refuse.
 
-    Exit code 1 if an expected vehicle was never heard, if none was heard, or if a loop delay (p99) exceeded the margin.
+    Exit code 1 if an expected vehicle was never heard, if none was heard, if a loop delay (p99) exceeded the margin, or
+    if a loop delay that has a margin was unknown or a lower bound for most of the last quarter of the time.
     """
     if request and silent:
         raise InputError("read --request and --silent, wanted one of them")
@@ -181,7 +182,7 @@ def _save(file: Path, recorder: "LinkRecorder", source: str, *, shown: bool) -> 
 def _print_rebuilt(report: "RebuildReport") -> None:
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
-    from gcs.watch.table import links_table
+    from gcs.watch.table import links_table, unjudged
 
     console, log = plain_console(), report.log
     left_out = "".join(f"; {count} {reason}" for reason, count in log.left_out.items())
@@ -191,7 +192,7 @@ def _print_rebuilt(report: "RebuildReport") -> None:
     elif report.flight is not None:
         print_flight(report.flight, console)
     else:
-        console.print(links_table(report.links, console.width))
+        console.print(links_table(report.links, console.width), *unjudged(report.links))
     if report.recorded is not None:
         console.print(f"recorded {report.recorded.verdict}: {delay_text(report.recorded)}")
 

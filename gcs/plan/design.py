@@ -256,6 +256,8 @@ class LinkPart(Published):
     loop_delay_s_p50: float
     loop_delay_s_worst: float
     headroom: float
+    lost_share: float = 0.0
+    """The largest share of datagrams that a vehicle's link up lost; the link down is taken to lose as many."""
     maximised: str = ""
     chosen: str = ""
     candidates: tuple[GainsAtDelay, ...] = ()

@@ -183,17 +183,21 @@ class Reception:
 
     def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:
         """Process one datagram with any content."""
-        if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
-            # PX4 sends heartbeats in MAVLink 1 until it is answered in MAVLink 2
-            frames = [one for one in mavlink.decode_1(datagram.data, self.counters) if one.msg_id == HEARTBEAT]
-        else:
-            frames = mavlink.decode(datagram.data, self.counters)
+        is_1 = datagram.data[:1] == b"\xfe"
+        frames = mavlink.decode_either(datagram.data, self.counters)
         for frame in mavlink.in_network(frames, datagram.address[2]):
             row = self._row.get(frame.system_id)
             if row is None:
                 self.counters["unknown system id"] += 1
                 continue
             vehicle = self._fleet.vehicles[row]
+            # PX4 sends heartbeats in MAVLink 1 until it is answered in MAVLink 2
+            is_early = self._fleet.speaks_mavlink_1_first and frame.msg_id == HEARTBEAT
+            if frame.component_id == AUTOPILOT_COMPONENT and not (is_1 and is_early):
+                vehicle.speaks_mavlink_1 = is_1
+            if is_1 and not is_early:
+                self.counters["not MAVLink 2"] += 1
+                continue
             if frame.component_id != AUTOPILOT_COMPONENT:
                 self.counters["other component"] += 1
                 if vehicle.address == datagram.address:
@@ -202,6 +206,9 @@ class Reception:
             if vehicle.address != datagram.address:
                 if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
+                    if frame.msg_id == HEARTBEAT:
+                        vehicle.note_rival(datagram.address, datagram.received_ns)
+                        self.touched.add(row)
                     continue
                 vehicle.address = datagram.address
                 self._report("vehicle", "found", vehicle.system_id)

@@ -47,7 +47,8 @@ class DisturbanceOnset(Published):
     kind: Kind
     vehicles: tuple[int, ...]
     """The vehicles whose errors cause the disturbance and are disturbed by it."""
-    radius_1_s: float
+    radius_1_s: float | None
+    """None: no disturbance of this kind is predicted to break the formation. Then nothing is flown."""
     frequency_rad_s: float
     onset_1_s: float | None
     error_1_s: float | None
@@ -120,7 +121,7 @@ def find_disturbance_onsets(
         _onset(plan, probes, case, tolerance, ended) for case in cases(plan, delay_s, kinds=kinds, counts=counts)
     )
     failure = None
-    if allowed is not None or all(onset.difference is None for onset in onsets):
+    if allowed is not None or all(onset.difference is None for onset in onsets if onset.radius_1_s is not None):
         failure = missed(onsets, inf if allowed is None else allowed)
     return DisturbanceResult(
         scenario=plan.scenario.name, loop_delay_s=delay_s, onsets=onsets, assert_onset=allowed, failure=failure
@@ -128,10 +129,10 @@ def find_disturbance_onsets(
 
 
 def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
-    """How many onsets are not measured, too far from the radius, or not known well enough to tell; None if none is."""
-    unknown = [o for o in onsets if o.difference is None]
+    """How many onsets with a radius are not measured, too far from it, or too rough to tell; None if none is."""
+    unknown = [o for o in onsets if o.difference is None and o.radius_1_s is not None]
     off = [o for o in onsets if o.difference is not None and abs(o.difference) > allowed]
-    rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * o.radius_1_s]
+    rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * (o.radius_1_s or inf)]
     reasons = (
         (unknown, "not measured"),
         (off, "farther than {} from the radius"),
@@ -226,7 +227,7 @@ def _onset(
     onset = None if inside is None else inside.varied
     missing = ""
     if not sizes:
-        missing = "no disturbance is predicted to break the formation"
+        missing = "no disturbance of this kind breaks the formation"
     elif not points:
         far = "" if linear else f", which left the linear range: {_linear_range_text(probe)}"
         missing = f"no growth rate in {len(sizes)} flights{far}"
@@ -235,7 +236,7 @@ def _onset(
     return DisturbanceOnset(
         kind=case.kind,
         vehicles=case.vehicles,
-        radius_1_s=radius,
+        radius_1_s=radius if radius < inf else None,
         frequency_rad_s=omega,
         onset_1_s=onset,
         error_1_s=None if inside is None else inside.error,

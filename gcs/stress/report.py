@@ -4,7 +4,7 @@ import platform
 import shlex
 import subprocess
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,6 +96,8 @@ class CampaignResult(Published):
     """How the vehicles respond to set-points, which the margin takes into account; None if they respond at once."""
     onset_missing: str
     onset_missing_as_predicted: bool
+    onset_contradicted: str
+    """The probe in which errors grow most although its loop delay is before the onset, in one line; "" if none."""
     curve_error: float | None
     assert_onset: float | None
     failure: str
@@ -124,10 +126,11 @@ def result_of(
 ) -> CampaignResult:
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
 
-    With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, or was predicted
-    but not found. It also fails if the standard error of an onset exceeds this fraction of the margin: its flights
-    cannot tell whether the onset is that close. The error is not added to the difference: a sufficiently certain onset
-    is judged by its measured value. A sweep in which every trial was aborted fails, too.
+    With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, if it was
+    predicted but not found, or if errors grow in a probe before it. It also fails if the standard error of an onset
+    exceeds this fraction of the margin: its flights cannot tell whether the onset is that close. The error is not added
+    to the difference: a sufficiently certain onset is judged by its measured value. A sweep in which every trial was
+    aborted fails, too.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
@@ -137,9 +140,14 @@ def result_of(
     failure = ""
     onsets = [each for each in (onset, onset_shorter) if each is not None]
     searched = [flight for each in onsets for flight in each.flights]
+    swept = sweep if [axis.name for axis in axes] == ["delay"] and exact(study, axes) else ()
+    contradicted = ""
+    if onset is not None and has_constant_links(study.plan.scenario):
+        begins_s = study.window_s[0] if onset_shorter is None else onset_shorter.loop_delay_s
+        contradicted = growth_before(onset, (*searched, *onset.checks, *swept), begins_s=begins_s)
     if allowed is not None:
         unknown = (str(each) for each in (missing, missing_shorter) if each is not None and not each.as_predicted)
-        failure = "; ".join(filter(None, (*unknown, *(_missed(each, allowed) for each in onsets))))
+        failure = "; ".join(filter(None, (*unknown, contradicted, *(_missed(each, allowed) for each in onsets))))
     failure = "; ".join(filter(None, (failure, _nothing_measured(sweep))))
     return CampaignResult(
         scenario=study.plan.scenario.name,
@@ -155,6 +163,7 @@ def result_of(
         onset_missing=str(missing or ""),
         onset_shorter_missing=str(missing_shorter or ""),
         onset_missing_as_predicted=missing is not None and missing.as_predicted,
+        onset_contradicted=contradicted,
         curve_error=curve_error([*(sweep if exact(study, axes) else ()), *searched]),
         assert_onset=allowed,
         failure=failure,
@@ -173,6 +182,30 @@ def result_of(
             git_commit=_commit(),
             machine=f"{platform.system()} {platform.machine()}",
         ),
+    )
+
+
+def growth_before(onset: Onset, probes: Iterable[Outcome], *, begins_s: float) -> str:
+    """The probe in which errors grow most, although its loop delay is between `begins_s` and the onset; "" if none.
+
+    Growth counts beyond three standard errors of its own and of the onset, and a hundredth of the range of the rates
+    from which the onset is known.
+    """
+    near = [own.growth_1_s for own in onset.flights if own.growth_1_s is not None]
+    spread, late_s = float(np.ptp(near)) if near else 0.0, onset.loop_delay_s + onset.error_s
+
+    def excess_1_s(own: Outcome) -> float:
+        if own.kind != "probe" or own.growth_1_s is None or not begins_s < (own.loop_delay_s or 0.0) <= late_s:
+            return 0.0
+        past_s = max(0.0, (own.loop_delay_s or 0.0) - onset.loop_delay_s + 3.0 * onset.error_s)
+        return own.growth_1_s - 3.0 * (own.growth_error_1_s or 0.0) - abs(onset.slope_1_s2) * past_s - 0.01 * spread
+
+    worst = max((own for own in probes if excess_1_s(own) > 0.0), key=excess_1_s, default=None)
+    if worst is None or worst.loop_delay_s is None:
+        return ""
+    return (
+        f"errors of vehicle {worst.critical} grow at {worst.growth_1_s:+.4g} 1/s already at {worst.loop_delay_s:.5f} s "
+        f"of loop delay (trial {worst.id})"
     )
 
 

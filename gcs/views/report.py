@@ -26,6 +26,8 @@ from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_console, table_of, vehicles_text
 from scenarios.schema import GainBlock
 
+_LOSSY = 0.1
+"""Above this share of lost datagrams, gains for measured links are printed with a warning."""
 _HASH = 12
 """Number of digits shown of a hash."""
 
@@ -73,6 +75,9 @@ def print_design(design: Design, console: Console | None = None) -> None:
         measured = f"loop delay {ms_text(link.loop_delay_s_p50)} (median), {ends}, measured in {link.source}"
         console.print(f"link     {measured}; wanted headroom {link.headroom:.0%} at the worst")
         console.print(f"         chosen {link.chosen}")
+        if link.lost_share > _LOSSY:
+            hides = "as many set-points may be, and the previous one then acts on, which these delays do not show"
+            console.print(f"losses   {link.lost_share:.0%} of a vehicle's datagrams were lost: {hides}")
     if design.criteria is not None:
         _print_criteria(design.criteria, console)
     if design.trade_off:

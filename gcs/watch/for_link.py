@@ -44,8 +44,11 @@ def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> LinkPa
     The slowest vehicle's median and, around it, the widest spread of any vehicle to its 1st and to its 99th percentile.
     """
     spreads: list[list[float]] = []
+    lost_share = 0.0
     for system_id in recorder.measured:
         profile = recorder.profile(source, only=system_id)
+        if (loss := profile.up.loss_bursts) is not None:
+            lost_share = max(lost_share, loss.to_bad_probability / (loss.to_bad_probability + loss.to_good_probability))
         drawn_s = drawn_loop_delays_s(scenario, profile.up, profile.down)
         spreads.append(np.percentile(drawn_s[np.isfinite(drawn_s)], [1.0, 50.0, 99.0]).tolist())
     median_s = max(middle_s for _, middle_s, _ in spreads)
@@ -58,6 +61,7 @@ def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> LinkPa
         loop_delay_s_p50=median_s,
         loop_delay_s_worst=median_s + longer_s,
         headroom=scenario.control.link_headroom,
+        lost_share=lost_share,
     )
 
 

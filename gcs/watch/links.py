@@ -27,7 +27,7 @@ from gcs.link.clocks import UNANSWERED, UNANSWERED_NS
 from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
-from gcs.link.vehicle import RemoteVehicle
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle
 from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
@@ -41,6 +41,8 @@ SYSTEM_ID = 254
 """System id of the watch's requests. It differs from a station's, whose sequence numbers vehicles track."""
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
+_GAP_NS = round(SILENCE_S * NS_PER_S)
+"""A longer gap between two states is a silence: the vehicle would be lost in flight, and get no set-points."""
 SAMPLE_NS = NS_PER_S // 10
 """Mean time between two looks, each of which records the age of the newest states."""
 PAST = "past the margin"
@@ -68,6 +70,8 @@ class LinkFigures(Published):
     telemetry_age_s: Estimate
     loop_delay_s: Estimate
     headroom: float | None
+    unjudged: bool
+    """Whether there is a margin, but the loop delay was unknown or a lower bound for most of the last quarter."""
     received: int
     lost: int
     late: int
@@ -94,8 +98,8 @@ class WatchReport(Published):
 
     @property
     def failed(self) -> bool:
-        """Whether a vehicle was never heard or a loop delay exceeded the margin, whatever the vehicle does now."""
-        bad = any(v.status in ("not heard", PAST) or (v.headroom or 0.0) < 0.0 for v in self.vehicles)
+        """Whether a vehicle was never heard, or a loop delay exceeded the margin or could not be compared with it."""
+        bad = any(v.unjudged or v.status in ("not heard", PAST) or (v.headroom or 0.0) < 0.0 for v in self.vehicles)
         return bad or not self.vehicles
 
 
@@ -139,18 +143,24 @@ class WatchedVehicle:
         self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # detects a clock jump
         if boot_ns < self.boot_ns:
             self._least_ns = (1 << 62, 1 << 62)  # the vehicle's clock has restarted
-        if self.states and received_ns - self.state_ns > SILENT_NS:
+        if self.states and boot_ns > self.boot_ns:
+            self._interval_ns = min(self._interval_ns, boot_ns - self.boot_ns)
+        if self._has_gap(received_ns):
+            self.first_state_ns += received_ns - self.state_ns  # a silence does not lower the rate
             for looks in (self.age_s, self.loop_delay_s):
                 looks[self._judged :] = array("d", [nan]) * (len(looks) - self._judged)
         self._judged = len(self.age_s)
-        if self.states and boot_ns > self.boot_ns:
-            self._interval_ns = min(self._interval_ns, boot_ns - self.boot_ns)
         self.first_state_ns = self.first_state_ns if self.states else received_ns
         self.states += 1
         self.state_ns, self.boot_ns = received_ns, boot_ns
         if received_ns - self._least_since_ns > _LEAST_NS:
             self._least_since_ns, self._least_ns = received_ns, (1 << 62, self._least_ns[0])
         self._least_ns = min(self._least_ns[0], received_ns - boot_ns), self._least_ns[1]
+
+    def _has_gap(self, now_ns: int) -> bool:
+        """Whether no state came for so long that it was not sent, or is lost. Some vehicles send one every 2 s."""
+        usual_ns = self._interval_ns if self.states > 1 else 0
+        return self.states > 0 and now_ns - self.state_ns > max(_GAP_NS, 2 * usual_ns)
 
     @property
     def least_delay_ns(self) -> int:
@@ -190,7 +200,7 @@ class WatchedVehicle:
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s, repeated_s))
 
     def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> LinkFigures:
-        """The figures over the whole time, or over the `last` looks."""
+        """The figures over the whole time, or over the `last` looks, which then stand for the last quarter."""
         clock, frames = self.remote.clock, self.remote.frames
         known = clock.estimate if clock.samples else None
         age_s, loop_s = (_spread(looks[: self._judged], last) for looks in (self.age_s, self.loop_delay_s))
@@ -207,6 +217,7 @@ class WatchedVehicle:
             telemetry_age_s=age_s,
             loop_delay_s=loop_s,
             headroom=left if margin_s else None,
+            unjudged=margin_s is not None and (known is None or not self._known_late(now_ns, last)),
             received=frames.received,
             lost=frames.lost,
             late=frames.late,
@@ -220,6 +231,13 @@ class WatchedVehicle:
                 jumps=clock.jumps,
             ),
         )
+
+    def _known_late(self, now_ns: int, last: int) -> bool:
+        """Whether the loop delay is known at half of the last quarter of the looks, or of the `last` ones."""
+        count, late = len(self.loop_delay_s), last or -(-len(self.loop_delay_s) // 4)
+        judged = self._judged if self._has_gap(now_ns) else count
+        known = np.isfinite(np.array(self.loop_delay_s[max(0, count - late) : judged]))
+        return 2 * int(known.sum()) >= min(late, count) > 0
 
     def _status(self, now_ns: int, loop_delay_s: float | None, left: float | None) -> str:
         if not self.remote.heard_ns:

@@ -22,11 +22,13 @@ from gcs.control.loop_delay import longest_repetition_ns, repeated_s
 from gcs.control.loops import Moment, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
+from gcs.link.clocks import UNANSWERED
 from gcs.link.vehicle import SILENCE_S, ignored
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
+from gcs.station.absence import GROUNDED, absence
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.modes import VehicleState
 from gcs.station.reception import new_reported
@@ -51,6 +53,8 @@ class Rebuilt:
     links: Watch
     own: bool
     """Whether this station wrote the log, so that its ticks and the flight's end are known."""
+    grounded: dict[int, str]
+    """Why vehicles were on the ground at the flight's last tick, by system id, as of `gcs.station.absence`."""
 
 
 class _Outline(NamedTuple):
@@ -152,6 +156,7 @@ class _Rebuilding:
         self._lost = [False] * len(ids)
         self._law = self._fleet.loop.law(self._lost)
         self._telemetry_ns = [0] * len(ids)
+        self._grounded: dict[int, str] = {}
         self._reported = new_reported(len(ids))
         self._states = [VehicleState()] * len(ids)
         self._jumps = [0] * len(ids)
@@ -190,7 +195,7 @@ class _Rebuilding:
         self._look(self._newest_ns + self._period_ns)  # one more tick, which shows what arrived after the last one
         rows = in_sequence(self._rows) if self._rows else np.empty(0, TICK)
         rows = rows[np.argsort(rows["tick"], kind="stable")]
-        return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys))
+        return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys), self._grounded)
 
     def _set_point(self, time_ns: int, frame: mavlink.Frame) -> None:
         key_ms, command, target = frame.fields[0], frame.fields[7:9], frame.fields[13]
@@ -272,8 +277,19 @@ class _Rebuilding:
             self._lost, self._law = lost, self._fleet.loop.law(lost)
         now = Moment(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
         controls = self._fleet.loop.control(self._history, self._law, unblended(len(lost)), now)
-        near = nearest(controls, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else np.empty(0))
+        why = [absence(own.remote, gone=gone) for own, gone in zip(self._vehicles, lost, strict=True)]
+        grounded = {
+            own.remote.system_id: text for own, text in zip(self._vehicles, why, strict=True) if text in GROUNDED
+        }
+        self._grounded = grounded if flying else self._grounded
+        off_the_ground = controls.copy()
+        off_the_ground["state"][[text in GROUNDED for text in why]] = nan
+        near = nearest(
+            off_the_ground, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else np.empty(0)
+        )
         ids = [vehicle.remote.system_id for vehicle in self._vehicles]
+        if self._outline.exchanges:
+            self._judge_silence(due_ns)
         sent = [commands.get(system_id, (sent_ns, None)) for system_id in ids]
         controls["command_m_s2"] = [one or (nan, nan) for _, one in sent]
         tolerated = [self._fleet.plan.tolerance_of(*own) for own in enumerate(controls["assumed_s"].tolist())]
@@ -289,6 +305,15 @@ class _Rebuilding:
         tick = Tick(number, time_s, due_ns, key_ms, judged, np.empty(0, np.int64))
         rows, _ = tick_rows(tick, judged, self._fleet.links, near.distance_m, np.array([own_ns for own_ns, _ in sent]))
         self._rows.append(rows)
+
+    def _judge_silence(self, now_ns: int) -> None:
+        """Note which vehicles no longer answer TIMESYNC. A request in the log does not say for whom it is.
+
+        So the time since the newest reply decides, not the number of requests. A vehicle that says nothing is silent.
+        """
+        for vehicle, heard_ns in zip(self._vehicles, self._telemetry_ns, strict=True):
+            if vehicle.rtt_s and not vehicle.exchanges(now_ns) and now_ns - heard_ns <= SILENCE_S * NS_PER_S:
+                vehicle.remote.clock.unanswered = UNANSWERED  # until the next reply
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:
         """The oldest round trip that no earlier tick holds; NaN if there is none."""

@@ -17,7 +17,7 @@ from gcs.runs.files import read_design, read_summary
 from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE, tlog_file
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
-from gcs.station.absence import COMPLETED
+from gcs.station.absence import end_reason
 from gcs.station.breakage import too_far
 from gcs.watch.links import LinkFigures
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
@@ -120,20 +120,23 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     last = flown[flown["tick"] == flown["tick"][-1]]
     if broken := _broken(scenario, last):
         return broken
-    left = sorted({vehicle.system_id for vehicle in scenario.vehicles} - set(last["system_id"].tolist()))
+    known = {vehicle.system_id for vehicle in scenario.vehicles}
+    left = sorted(known - set(last["system_id"].tolist()) - rebuilt.grounded.keys())
     if left:
         return f"vehicles {', '.join(map(str, left))} are sent nothing at the end"  # lost, or flown by their pilots
     end_s = float(last["time_s"][0])
     if end_s < scenario.duration_s - 1.5 / scenario.rates.control_hz:
         return f"interrupted: set-points end after {end_s:.1f} s of {scenario.duration_s:g} s"
-    return COMPLETED
+    vehicles = [watched.remote for watched in rebuilt.links.vehicles.values()]
+    return end_reason(vehicles, [rebuilt.grounded.get(vehicle.system_id, "") for vehicle in vehicles])
 
 
 def _broken(scenario: Scenario, last: TickArray) -> str:
     """The first safety limit that the last tick violates, as a reason to end the flight; "" if none."""
     closest_m, limit_m = float(np.fmin.reduce(last["nearest_m"])), scenario.safety.spacing_error_limit_m
     if closest_m < scenario.safety.collision_distance_m:
-        return f"broken: vehicles have collided, {closest_m:.1f} m apart"
+        two = " and ".join(map(str, sorted(last["system_id"][last["nearest_m"] == closest_m].tolist())))
+        return f"broken: vehicles {two} have collided, {closest_m:.1f} m apart"
     for row in last:
         error_m = hypot(row["spacing_error_north_m"], row["spacing_error_east_m"])
         if error_m > limit_m:

@@ -22,7 +22,8 @@ _USUAL, _WIDE = 73, 140
 
 def render(report: WatchReport, *, width: int, height: int | None = None) -> RenderableType:
     """The whole display, in at most `height` lines: the worst vehicles that fit, and the number of the others."""
-    vehicles, notes = report.vehicles, [*_without_position(report), *_of_rates(report)]
+    vehicles = report.vehicles
+    notes = [*_without_position(report), *_of_rates(report), *unjudged(vehicles)]
     room = len(vehicles) if height is None else max(1, height - 6 - max(1, len(notes)))
     if len(vehicles) > room:
         vehicles = sorted(sorted(vehicles, key=_badness)[: max(1, room - 1)], key=lambda figures: figures.system_id)
@@ -46,7 +47,8 @@ def plain_line(report: WatchReport) -> str:
 
 
 def _badness(figures: LinkFigures) -> tuple[bool, float]:
-    return figures.status not in ("silent", "not heard"), 1.0 if figures.headroom is None else figures.headroom
+    heard = figures.status not in ("silent", "not heard") and not figures.unjudged
+    return heard, 1.0 if figures.headroom is None else figures.headroom
 
 
 def _headline(report: WatchReport) -> Text:
@@ -79,6 +81,12 @@ def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
         ("", 15, 0, lambda v: Text(f" {v.status}", STATUS_STYLES.get(v.status, "yellow"))),
     ]
     return fitted_table(vehicles, columns, width=width, gap=1 if width >= _WIDE else 0)
+
+
+def unjudged(vehicles: Sequence[LinkFigures]) -> list[Text]:
+    """A note about vehicles whose headroom says nothing about the end of the watch, if there are any."""
+    which = " ".join(str(v.system_id) for v in vehicles if v.unjudged)
+    return [Text(f"not judged: {which}; loop delay unknown or a lower bound at the end", "yellow")] if which else []
 
 
 def _bound(figures: LinkFigures) -> str:

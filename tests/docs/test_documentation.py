@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from docs.generate import blocks, measurements, reference
-from docs.generate.keys import schema
+from docs.generate.keys import keys_page, schema
 from docs.generate.measurements import FIGURES
 from docs.generate.reference import described, found_fields
 from docs.generate.runner import CommandError, Runner
@@ -133,7 +133,7 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     designs = (with_bounds(with_spread(with_trade_off(design), plan), plan.scenario) for design, plan in planned)
     link = LinkPart(
         source="runs/log", vehicles=(1,), loop_delay_s_least=0.1, loop_delay_s_p50=0.2, loop_delay_s_worst=0.3,
-        headroom=0.3, maximised="alpha", chosen="", candidates=(GainsAtDelay(prediction=True),),
+        headroom=0.3, lost_share=0.2, maximised="alpha", chosen="", candidates=(GainsAtDelay(prediction=True),),
     )  # fmt: skip
     found = [found_fields(design.to_dict(), known) for design in (*designs, Design(delay_margin_s=1.0, for_link=link))]
     assert set[str]().union(*found) == known.keys()
@@ -258,3 +258,19 @@ def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as Markdown renderers make them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
+
+
+@pytest.mark.parametrize(
+    ("key", "unit", "value"),
+    [
+        ("jerk_max_m_s3", "m/s³", "number"),
+        ("drag_1_m", "1/m", "number"),
+        ("spacing_gain_max_s2", "s²", "number"),
+        ("wind_ne_m_s2", "m/s², north and east", "2 numbers"),
+        ("queue_bytes", "bytes", "whole number"),
+        ("waypoints_ne_m", "m, north and east", "rows of 2 numbers"),
+        ("gain", "", "2 rows of numbers"),
+    ],
+)
+def test_keys_are_listed_with_their_unit_and_kind_of_value(key: str, unit: str, value: str) -> None:
+    assert f"| `{key}` | {unit} | {value} |" in keys_page()

@@ -17,6 +17,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.studies.front import compared, point_at, searched_in
 from gcs.studies.virtual import fly_virtual
+from gcs.views.report import print_design
 from gcs.watch.before_flight import measured_now
 from gcs.watch.for_link import best_for, evaluated
 from scenarios.errors import ScenarioError
@@ -166,6 +167,19 @@ def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> Non
     assert before.loop_delay_s_p50 == pytest.approx(known(flown_s.p50), abs=PERIOD_S / 2.0)
     # clocks are known within half a round trip only, but not its length: the spread is that of both ways together
     assert before.loop_delay_s_worst - before.loop_delay_s_least == pytest.approx(2 * 0.03 + PERIOD_S, rel=0.25)
+
+
+def test_measured_links_that_lose_datagrams_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    lossy = VehicleLinks(system_id=3, up=Link(delay_s=0.02, loss_probability=0.4))
+    links = CHAIN.links.model_copy(update={"vehicles": (lossy,)})
+    for own, share in ((links, 0.4), (CHAIN.links, 0.0)):
+        scenario = CHAIN.model_copy(update={"control": Control(for_link="measured"), "links": own})
+        part = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
+        assert part.lost_share == pytest.approx(share, abs=0.1)
+        chosen, part = best_for(scenario, part)
+        print_design(flight_plan(chosen)[0].model_copy(update={"for_link": part}))
+        told = f"losses   {part.lost_share:.0%} of a vehicle's datagrams were lost"
+        assert (told in capsys.readouterr().out) == (share > 0.0)
 
 
 def test_links_that_cannot_be_measured_before_a_flight_are_refused() -> None:

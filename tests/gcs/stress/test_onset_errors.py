@@ -5,8 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from gcs.cli.results import print_disturbances
 from gcs.plan.design import Design
-from gcs.stress.disturbance import DisturbanceOnset, missed
+from gcs.stress.disturbance import DisturbanceOnset, DisturbanceResult, missed
 from gcs.stress.measure import fly_trial
 from gcs.stress.report import CampaignResult, result_of
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
@@ -49,18 +50,51 @@ def test_an_onset_is_asserted_no_finer_than_it_is_known(difference: float, error
     assert found.failure.count("\n") == 0
 
 
-def test_a_disturbance_is_asserted_no_finer_than_it_is_known() -> None:
-    def found(error: float, difference: float | None = 0.0) -> DisturbanceOnset:
+def test_a_disturbance_is_asserted_no_finer_than_it_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    def found(error: float, difference: float | None = 0.0, *, radius: float | None = 2.0) -> DisturbanceOnset:
         return DisturbanceOnset(
-            kind="dynamic", vehicles=(1, 2), radius_1_s=2.0, frequency_rad_s=1.0,
+            kind="dynamic", vehicles=(1, 2), radius_1_s=radius, frequency_rad_s=1.0,
             onset_1_s=None if difference is None else 2.0 * (1.0 + difference),
             error_1_s=2.0 * error, difference=difference, flights=3, measured=3,
+            missing="none" if radius is None else "",
         )  # fmt: skip
 
     assert missed([found(0.04), found(0.04)], 0.05) is None
     assert missed([found(0.06), found(0.04)], 0.05) == "1 of 2 onsets are known less well than to 5.000% of the radius"
     assert missed([found(0.0, 0.06)], 0.05) == "1 of 1 onsets are farther than 5.000% from the radius"
     assert missed([found(0.0, None), found(0.0)], 0.05) == "1 of 2 onsets are not measured"
+    never = found(0.0, None, radius=None)
+    assert missed([never, found(0.0)], 0.05) is None  # nothing is predicted, so nothing is missed
+    unbroken = DisturbanceResult(scenario="s", loop_delay_s=0.1, onsets=(never,))
+    assert '"radius_1_s": null' in unbroken.to_json()
+    print_disturbances(unbroken)
+    assert "one follower, dynamic, none, by prediction alone" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("loop_delay_s", "growth", "error", "said"),
+    [
+        (0.4, 0.02, 0.001, True),
+        (0.4, 0.02, 0.01, False),  # perhaps it does not grow
+        (0.4, -0.1, 0.001, False),
+        (0.5, 0.02, 0.001, True),  # as the probes of other vehicles, at the onset
+        (0.4999, 0.0001, 0.0, False),
+        (0.6, 0.1, 0.001, False),
+    ],
+)
+def test_a_probe_that_grows_before_the_onset_contradicts_it(
+    loop_delay_s: float, growth: float, error: float, said: bool
+) -> None:
+    probe = Outcome(
+        "abc", "probe", 1, {"delay": loop_delay_s}, False, critical=3, growth_1_s=growth, growth_error_1_s=error,
+        loop_delay_s=loop_delay_s,
+    )  # fmt: skip
+    near = tuple(replace(probe, growth_1_s=rate, loop_delay_s=0.5 + rate) for rate in (-0.01, 0.01))
+    for allowed in (None, 0.05):
+        found = result(replace(onset(0.0, 0.001), flights=near, checks=(probe,)), allowed=allowed)
+        line = f"errors of vehicle 3 grow at +0.02 1/s already at {loop_delay_s:.5f} s of loop delay (trial abc)"
+        assert found.onset_contradicted == (line if said else "")
+        assert found.failure == (line if said and allowed is not None else "")
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,12 @@ def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     again = json.loads(run(tmp_path, *options, "--json", "--resume"))
     assert (out / TRIALS_FILE).read_bytes() == lines
     assert again["onset"] == onset
+    before = (out / "stress.json").read_bytes()
+    for other in (["--onset-of", "2"], ["--delay", "0"]):
+        refused = CliRunner().invoke(app, [str(tmp_path / "pair.toml"), *other, "--out", str(out), "--resume"])
+        assert isinstance(refused.exception, InputError), refused.output
+        assert "holds the onset of --onset, wanted --onset again, or a folder of its own" in str(refused.exception)
+    assert (out / "stress.json").read_bytes() == before
 
 
 def test_a_campaign_is_taken_up_with_its_own_scenario_only(tmp_path: Path) -> None:

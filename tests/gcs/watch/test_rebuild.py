@@ -8,18 +8,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep
 from gcs.link import mavlink
 from gcs.plan.design import Design
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan, over_own_links
+from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
+from gcs.station.absence import COMPLETED
+from gcs.station.station import Station
 from gcs.watch.rebuild import rebuild
 from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.keys.link import Link, Links, VehicleLinks
-from scenarios.schema import Scenario
+from scenarios.schema import NS_PER_S, NominalVelocity, Scenario
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.delay_ramp import ramp
-from tests.support.fleets.logged_flight import EPOCH_NS, flown, log_bytes
+from tests.support.fleets.flown_copters import plan_for
+from tests.support.fleets.logged_flight import EPOCH_NS, Logged, flown, log_bytes
+from tests.support.fleets.pilots import PilotsVehicle, flight_s
+from tests.support.fleets.pilots import flown as pilots_flight
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -185,6 +196,55 @@ def test_a_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
     rebuilt = rebuild_report(parse_tlog(log_bytes(kept)), source).flight
     assert rebuilt is not None
     assert (rebuilt.verdict, rebuilt.reason) == ("aborted", "vehicles 3 are sent nothing at the end")
+
+
+class Unanswering:
+    """The vehicles of a scenario, of which the third stops answering TIMESYNC after two seconds."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._fleet = Fleet(scenario, START_NS)
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        return [
+            (system_id, data, at_ns)
+            for system_id, data, at_ns in self._fleet.step(received, now_ns)
+            if (system_id, data[7]) != (3, mavlink.TIMESYNC) or at_ns < START_NS + 2 * NS_PER_S
+        ]
+
+
+def rebuilt_with(scenario: Scenario, vehicles: Vehicles, plan: FlightPlan | None = None) -> tuple[Summary, Summary]:
+    """The summary of a flight with these vehicles, and the one made of its log."""
+    design, planned = over_own_links(*flight_plan(scenario))
+    plan = plan or planned
+    station, logged = Station(plan, start_ns=START_NS), Logged(vehicles)
+    ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=logged)))
+    end = Event(time_s=0.0, kind="end", text=station.end_reason)
+    source = LogSource(Path("flight.tlog"), scenario, design, None)
+    rebuilt = rebuild_report(parse_tlog(log_bytes(logged.entries)), source).flight
+    assert rebuilt is not None
+    return summarise(scenario, design, ticks, [*station.events, end]), rebuilt
+
+
+def test_a_vehicle_that_no_longer_answers_timesync_has_no_delay_in_its_log_either() -> None:
+    scenario = scenario_of("chain3").model_copy(update={"duration_s": 12.0})
+    summary, rebuilt = rebuilt_with(scenario, Unanswering(scenario))
+    assert (rebuilt.verdict, rebuilt.reason) == (summary.verdict, summary.reason) == ("unknown", COMPLETED)
+    for was, found in zip(summary.vehicles, rebuilt.vehicles, strict=True):
+        assert found.loop_delay_s.samples == pytest.approx(was.loop_delay_s.samples, abs=10)
+
+
+def test_a_vehicle_on_the_ground_is_known_from_its_log() -> None:
+    """Its pilot lands it; the others fly over it."""
+    speeds = ((0.0, 0.0), (25.0, 3.0))
+    over = tuple(NominalVelocity(from_s=at_s, velocity_ne_m_s=(-speed, speed)) for at_s, speed in speeds)
+    scenario = pilots_flight("ardupilot").model_copy(update={"duration_s": 32.0, "nominal_velocity": over})
+    land = {flight_s("ardupilot") + 1.0: RULES["ardupilot"].land_mode}
+    summary, rebuilt = rebuilt_with(
+        scenario, PilotsVehicle(Fleet(scenario, START_NS), "ardupilot", land), plan_for(scenario)
+    )
+    assert (rebuilt.verdict, rebuilt.reason) == (summary.verdict, summary.reason)
+    assert rebuilt.reason == "landed: vehicles 3"
+    assert rebuilt.distance_min_m == pytest.approx(summary.distance_min_m, abs=0.01)
 
 
 def test_without_a_scenario_the_links_are_all_that_is_told() -> None:

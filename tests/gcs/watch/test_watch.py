@@ -386,3 +386,53 @@ def test_a_delay_is_unknown_once_exchanges_have_stopped() -> None:
         vehicle = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3), last=20)[0]
         assert (vehicle.status, vehicle.headroom is None) == (status, status == "no exchange")
     assert vehicle.telemetry_age_s.p50 is not None
+
+
+@pytest.mark.parametrize("margin_s", [None, 0.3])
+@pytest.mark.parametrize(("stopped_s", "judged"), [(0.0, True), (3.0, True), (5.0, False), (10.0, False)])
+def test_what_has_a_margin_passes_only_if_its_delay_is_known_at_the_end(
+    margin_s: float | None, stopped_s: float, judged: bool
+) -> None:
+    """Of 10 s, the last 2.5 count. Exchanges that stopped are missed after two seconds."""
+    watched = Watched(linked(Link(delay_s=0.02), Link(delay_s=0.02)), timesync_hz=10.0)
+    watched.run(10.0 - stopped_s)
+    watched.requests = Requests(0.0)
+    watched.run(stopped_s)
+    figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=margin_s))
+    assert {vehicle.unjudged for vehicle in figures} == {margin_s is not None and not judged}
+    report = report_of(figures)
+    assert report.failed == (margin_s is not None and not judged)
+    text = io.StringIO()
+    Console(file=text, width=120).print(render(report, width=120))
+    assert ("not judged: 1 2 3; loop delay unknown" in text.getvalue()) == report.failed
+
+
+@pytest.mark.parametrize(("silent_s", "longest_s"), [(1.2, 1.2), (1.8, 0.05), (2.5, 0.05)])
+def test_a_silence_after_which_a_flight_would_lose_the_vehicle_is_no_latency(silent_s: float, longest_s: float) -> None:
+    """States at 20 Hz. The looks before the gap ends are up to 0.15 s early."""
+    watch, peer, now_ns = Watch([1]), Peer(1), 0
+    for tick in range(400):
+        now_ns = 100 * START_NS + 50 * MS * tick + (round(silent_s * 1e9) if tick >= 200 else 0)
+        if tick == 200:
+            for early_ns in range(round(silent_s * 1e9), 0, -10 * MS):
+                watch.look(now_ns - early_ns)
+        peer.say(watch, mavlink.LOCAL_POSITION_NED, (now_ns // MS, *(0.0,) * 6), now_ns)
+        peer.say(watch, mavlink.TIMESYNC, (now_ns, watch.ask(now_ns)), now_ns)
+        watch.look(now_ns + 49 * MS)
+    [figures] = watch.figures(now_ns, Design(delay_margin_s=0.3))
+    assert longest_s - 0.16 < known(figures.loop_delay_s.max) < longest_s + 0.06
+    assert figures.telemetry_hz == pytest.approx(20.0, rel=0.01 if silent_s > 1.5 else 0.07)
+    assert not figures.unjudged
+
+
+def test_states_that_come_every_two_seconds_are_no_silence() -> None:
+    watch, peer, now_ns = Watch([1]), Peer(1), 0
+    for tick in range(200):
+        now_ns = 100 * START_NS + 100 * MS * tick
+        if tick % 20 == 0:
+            peer.say(watch, mavlink.LOCAL_POSITION_NED, (now_ns // MS, *(0.0,) * 6), now_ns)
+        peer.say(watch, mavlink.TIMESYNC, (now_ns, watch.ask(now_ns)), now_ns)
+        watch.look(now_ns + 50 * MS)
+    [figures] = watch.figures(now_ns, Design(delay_margin_s=5.0))
+    assert known(figures.loop_delay_s.max) == pytest.approx(2.0, abs=0.2)
+    assert not figures.unjudged
