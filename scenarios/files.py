@@ -311,8 +311,7 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
             wanted = "no such key with natural_frequency_rad_s: one model at a time"
             yield f"{key}.dead_time_s", part.dead_time_s, wanted
     if scenario.dynamics == "autopilot":
-        if scenario.altitude_m == 0:
-            yield "altitude_m", scenario.altitude_m, "an altitude above 0 to take off to, with dynamics autopilot"
+        yield from _take_off_contradictions(scenario)
         return
     for k, vehicle in enumerate(scenario.vehicles):
         if vehicle.flavour is not None:
@@ -320,6 +319,19 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if scenario.response is not None and scenario.dynamics == "double_integrator":
         wanted = "no such key with dynamics double_integrator, which respond at once"
         yield "response", scenario.response.model_dump(), wanted
+
+
+def _take_off_contradictions(scenario: Scenario) -> Iterator[Fault]:
+    if not scenario.altitude_m or "altitude_m" not in scenario.model_fields_set:
+        read = scenario.altitude_m if "altitude_m" in scenario.model_fields_set else InWords("no such key")
+        yield "altitude_m", read, "an altitude above 0 to take off to, with dynamics autopilot"
+        return
+    climb_m_s, patience_s = scenario.autopilot.climb_max_m_s, scenario.safety.ready_patience_s
+    for k, vehicle in enumerate(scenario.vehicles):
+        if (altitude_m := scenario.altitude_of(vehicle)) > climb_m_s * patience_s:
+            key = "altitude_m" if vehicle.altitude_m is None else f"vehicles[{k}].altitude_m"
+            reached = f"autopilot.climb_max_m_s = {climb_m_s:g} reaches in safety.ready_patience_s = {patience_s:g}"
+            yield key, altitude_m, f"at most {climb_m_s * patience_s:g}, which {reached}"
 
 
 def _sector_contradictions(scenario: Scenario) -> Iterator[Fault]:

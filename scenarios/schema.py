@@ -306,7 +306,8 @@ class Scenario(Part):
     duration_s: Annotated[float, Field(gt=0, le=86400)]
     """How long the formation is flown."""
     altitude_m: NotNegative = 1000.0
-    """Altitude above the origin, for vehicles without one of their own."""
+    """Altitude above the origin, for vehicles without one of their own; required with dynamics autopilot, which takes
+    off to it."""
     vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=MOST_VEHICLES)]
     """The formation: one tree, whose root is the leader."""
     nominal_velocity: tuple[NominalVelocity, ...] = ()

@@ -178,7 +178,7 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         "command\nm/s²": lambda v: f"{v.command_m_s2:.2f}",
         "limit\nm/s²": lambda v: number_text(v.command_max_m_s2, ".2f"),
         "loop\nms": lambda v: ms_text(v.expected_loop_delay_s, unit=""),
-        "link takes\nmore, ms": lambda v: ms_text(v.link_delay_left_s, unit=""),
+        f"link takes\n+ms ± {ms_text(found.phase_s, unit='')}": lambda v: ms_text(v.link_delay_left_s, unit=""),
     }
     console.print(table_of(found.vehicles, columns, title=title, dense=True))
     if beyond := [v.system_id for v in found.vehicles if v.command_m_s2 > (v.command_max_m_s2 or float("inf"))]:
@@ -204,7 +204,8 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
     whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
     yield (
-        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links{whose}, {margin}, "
+        f"delay    loop {ms_text(found.expected_loop_delay_s, unit='')} ± {ms_text(found.phase_s)} expected from the "
+        f"links{whose}, {margin}, "
         f"headroom {number_text(found.headroom, '.0%')}{unstable}"
     )
     if not found.response_known:

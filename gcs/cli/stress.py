@@ -105,7 +105,7 @@ def stress(
 
     Simulated autopilots fly in virtual time. Their response is identified first, and the margin takes it into account.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, all trials of a sweep were aborted, disturbances are
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials were aborted, disturbances are
     predicted to break the formation but no onset with --disturbance was measured, or a trial flown again differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}

@@ -25,7 +25,8 @@ SavedLinks = Annotated[
     typer.Option("--save-links", metavar="FILE.toml", help="write the links as a profile for scenarios"),
 ]
 ComparedMargin = Annotated[
-    float | None, typer.Option("--margin", metavar="SECONDS", help="compare with this delay margin", min=0.0)
+    float | None,
+    typer.Option("--margin", metavar="SECONDS", help="compare with this delay margin", min=0.001, max=30.0),
 ]
 
 

@@ -47,8 +47,8 @@ class VehicleCheck(Published):
     headroom: float | None
     """Defined as for the formation, at this vehicle's own expected loop delay."""
     link_delay_left_s: float | None
-    """How much more delay its link tolerates while all other links stay as they are. None if there is no limit, if it
-    is unknown, or if the station predicts over the measured delay, which adapts to the link."""
+    """How much more delay its link tolerates at the mean phase, if all other links stay as they are. None if unlimited
+    or unknown, or if the station predicts over the measured delay, which adapts to the link."""
 
 
 class PlannedMotionCheck(Published):
@@ -79,6 +79,9 @@ class ScenarioCheck(Published):
     """A scenario before its flight."""
 
     expected_loop_delay_s: float
+    phase_s: float
+    """Half the shorter period of telemetry and control. The phase between the two stays about the same during a flight:
+    its loop delay is up to this much longer or shorter than expected, and its links take as much less or more."""
     effective_loop_delay_s: float | None
     """The constant loop delay of equal effect on stability: longer with jitter or losses, because older commands keep
     acting. That of the vehicle left with the least headroom; None if next to nothing arrives."""
@@ -176,6 +179,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
+        phase_s=_phase_s(scenario),
         effective_loop_delay_s=_known(effective_s[critical]),
         effective_headroom=_known(left[critical]),
         channels_not_included=waits_for_channels(scenario),
@@ -196,6 +200,10 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
+
+
+def _phase_s(scenario: Scenario) -> float:
+    return 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
 
 
 def _assumed_s(plan: FlightPlan, delay_s: float) -> float:
@@ -221,8 +229,7 @@ def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | N
     average wait, but the actual wait, constant throughout a flight, may be up to half a period shorter or longer.
     """
     prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
-    rates = plan.scenario.rates
-    wait_s = 0.5 / max(rates.telemetry_hz, rates.control_hz)
+    wait_s = _phase_s(plan.scenario)
     for row, system_id in enumerate(plan.formation.system_ids):
         own = drawn[system_id]
         assumed_s = _assumed_s(plan, float(own.loop_s.mean()))

@@ -129,7 +129,7 @@ def result_of(
     With `allowed`, the campaign fails if an onset differs from the margin by more than this fraction, if it was
     predicted but not found, or if errors grow in a probe before it. It also fails if the standard error of an onset
     exceeds this fraction of the margin: its flights cannot tell whether the onset is that close. The error is not added
-    to the difference: a sufficiently certain onset is judged by its measured value. A sweep in which every trial was
+    to the difference: a sufficiently certain onset is judged by its measured value. A campaign in which every trial was
     aborted fails, too.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
@@ -148,7 +148,7 @@ def result_of(
     if allowed is not None:
         unknown = (str(each) for each in (missing, missing_shorter) if each is not None and not each.as_predicted)
         failure = "; ".join(filter(None, (*unknown, contradicted, *(_missed(each, allowed) for each in onsets))))
-    failure = "; ".join(filter(None, (failure, _nothing_measured(sweep))))
+    failure = "; ".join(filter(None, (failure, _nothing_measured(sweep) or _nothing_measured(outcomes))))
     return CampaignResult(
         scenario=study.plan.scenario.name,
         delay_margin_s=design.delay_margin_s,
@@ -221,11 +221,11 @@ def _missed(onset: Onset, allowed: float) -> str:
     return f"{at} ± {onset.error_s:.5f} s, an error of {share:.3%} of {margin}; {limit}" if share > allowed else ""
 
 
-def _nothing_measured(sweep: Sequence[Outcome]) -> str:
-    """Says that every trial of a sweep was aborted, and why; empty if one was not."""
-    if not sweep or any(outcome.verdict != "aborted" for outcome in sweep):
+def _nothing_measured(flown: Sequence[Outcome]) -> str:
+    """Says that every trial was aborted, and why; empty if one was not."""
+    if not flown or any(outcome.verdict != "aborted" for outcome in flown):
         return ""
-    return f"nothing was measured: all {len(sweep)} trials were aborted, the first: {sweep[0].reason}"
+    return f"nothing was measured: all {len(flown)} trials were aborted, the first: {flown[0].reason}"
 
 
 def _noise(outcomes: Sequence[Outcome]) -> Noise:

@@ -170,7 +170,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
             slowed.probe(link_s, seed=first_seed + (len(flights) + k if random_links else 0))
             for k, link_s in enumerate(links_s)
         ]
-        flights |= {outcome.id: outcome for outcome in run(trials)}
+        flights |= _flown(trials, run)
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
         grown = (
             GrowthPoint(way * o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
@@ -201,6 +201,14 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         if abs(ahead_s) < width_s:
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
     raise _not_located(list(flights.values()), zero if scatters else None, shorter=shorter)
+
+
+def _flown(trials: list[Trial], run: Run) -> dict[str, Outcome]:
+    """The outcomes of a round by their ids; raises NoOnset if all its flights were aborted."""
+    outcomes = run(trials)
+    if all(outcome.verdict == "aborted" for outcome in outcomes):
+        raise NoOnset(f"all {len(outcomes)} flights were aborted, the first: {outcomes[0].reason}")
+    return {outcome.id: outcome for outcome in outcomes}
 
 
 def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:

@@ -325,7 +325,11 @@ def _reason(summary: Summary) -> str:
         return summary.reason
     if summary.settling_time_s is not None:
         return f"errors are small after {summary.duration_s:.1f} s, but the loop delay is past the margin"
-    return f"not settled in {summary.duration_s:.1f} s; final spacing error {final_m:.2f} m, largest {most_m:.2f} m"
+    last = {change.system_id: change.text for change in summary.mode_changes}
+    all_released = all(last.get(own.system_id, "").endswith(Mode.FAILSAFE.name) for own in summary.vehicles)
+    then = ", then all vehicles were released to their failsafe" if all_released else ""
+    errors = f"final spacing error {final_m:.2f} m, largest {most_m:.2f} m"
+    return f"not settled in {summary.duration_s:.1f} s{then}; {errors}"
 
 
 def delay_text(summary: Summary) -> str:

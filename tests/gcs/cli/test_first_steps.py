@@ -109,7 +109,7 @@ def test_check_says_between_which_delays_a_predicted_loop_is_stable(
     text = copied("triangle5", "mine").replace("[control]", f"[control]\nprediction = {prediction}")
     Path("mine.toml").write_text(text)
     assert gcs(monkeypatch, "check", "mine.toml") == 0
-    assert f"delay    loop 50.0 ms expected from the links, {wanted}\n" in capsys.readouterr().out
+    assert f"delay    loop 50.0 ± 10.0 ms expected from the links, {wanted}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
