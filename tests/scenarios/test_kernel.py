@@ -1,7 +1,9 @@
 """Kernels that count no references to arrays are returned none, which would never be freed."""
 
 import gc
+import os
 import pkgutil
+import signal
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -88,3 +90,32 @@ def test_what_one_copy_of_the_source_compiled_no_other_compiles(
         assert square(3) == 9 + (name == "changed")
         known.append(sum(square._compiled.stats.cache_hits.values()))
     assert known == [0, 1, 0]
+
+
+def test_a_signal_waits_until_a_kernel_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba.core import config, event
+
+    class Interrupted(event.Listener):
+        def on_start(self, event: object) -> None:  # noqa: ARG002
+            if not order:
+                os.kill(os.getpid(), signal.SIGTERM)
+            order.append("compiles")
+
+        def on_end(self, event: object) -> None: ...
+
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    file = tmp_path / "cube.py"
+    file.write_text("from scenarios.kernel import kernel\n\n\n@kernel\ndef square(n: int) -> int:\n    return n**3\n")
+    order: list[str] = []
+
+    def handled(number: int, frame: object) -> None:  # noqa: ARG001
+        order.append("signal")
+
+    former = signal.signal(signal.SIGTERM, handled)
+    try:
+        with event.install_listener("numba:run_pass", Interrupted()):
+            assert loaded(file).square(3) == 27
+    finally:
+        signal.signal(signal.SIGTERM, former)
+    assert order.count("signal") == 1
+    assert order.index("signal") == len(order) - 1 > 1
