@@ -108,7 +108,7 @@ def test_a_signal_waits_until_a_kernel_is_compiled(tmp_path: Path, monkeypatch: 
     file.write_text("from scenarios.kernel import kernel\n\n\n@kernel\ndef square(n: int) -> int:\n    return n**3\n")
     order: list[str] = []
 
-    def handled(number: int, frame: object) -> None:  # noqa: ARG001
+    def handled(number: int, frame: object) -> None:
         order.append("signal")
 
     former = signal.signal(signal.SIGTERM, handled)

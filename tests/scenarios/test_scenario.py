@@ -91,6 +91,8 @@ BAD = {
     "not a number": ("[91.44, 0.0]", "[nan, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "finite"),
     "infinite": ("duration_s = 40.0", "duration_s = inf", "duration_s", "finite"),
     "beyond single precision": ("altitude_m = 1000.0", "altitude_m = 1e300", "altitude_m", "1000000"),
+    "no altitude": ("altitude_m = 1000.0", 'dynamics = "autopilot"', "altitude_m", "to take off to"),
+    "too high": ("altitude_m = 1000.0", 'altitude_m = 400\ndynamics = "autopilot"', "altitude_m", "at most 300"),
     "far away": ("[-121.92, 121.92]", "[-1e300, 121.92]", "vehicle 2: offset_ne_m[0]", "-1000000"),
     "faster than anything": ("[91.44, 0.0]", "[1e5, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "10000"),
     "a delay of years": ("up = { delay_s = 0.02 }", "up = { delay_s = 1e9 }", "links.up.delay_s", "1000000"),

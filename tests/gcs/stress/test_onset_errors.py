@@ -148,3 +148,18 @@ def test_a_sweep_that_only_aborts_fails_and_says_why() -> None:
     assert not told.passed
     assert told.failure == f"nothing was measured: all 2 trials were aborted, the first: {sweep[0].reason}"
     assert result(None, sweep=[replace(sweep[0], verdict="stable"), sweep[1]], allowed=None).passed
+
+
+def test_a_search_whose_first_flights_all_abort_goes_no_further() -> None:
+    flown: list[Outcome] = []
+
+    def run(trials: Sequence[Trial]) -> list[Outcome]:
+        flown.extend(aborted(trial) for trial in trials)
+        return flown
+
+    with pytest.raises(NoOnset, match="all 5 flights were aborted, the first: not ready"):
+        find_onset(STUDY, run, tolerance=0.05)
+    assert len(flown) == 5
+    assert not result_of(
+        STUDY, Design(delay_margin_s=MARGIN_S), flown, axes=[], sweep=[], onset=None, allowed=None
+    ).passed
