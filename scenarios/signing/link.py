@@ -156,7 +156,6 @@ def _toggled(frame: bytes) -> bytes:
     return frame[:2] + bytes([frame[2] ^ SIGNED]) + frame[3:-CHECKSUM] + checksum.to_bytes(2, "little")
 
 
-
 def _remember(recent: list[int], timestamp: int) -> None:
     """Add a timestamp to the heap of a stream's newest: all that were seen and are newer than its first are in it."""
     heappush(recent, timestamp)
