@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
-from sim_vehicles.services import mavlink, messages
+from sim_vehicles.services import frames, mavlink, messages
 from sim_vehicles.services.mavlink import ACCEPTED, DENIED, UNSUPPORTED, Command, Encoder
 from sim_vehicles.services.messages import EXTRA, PARAMETER_VALUE, Message, Request
 from sim_vehicles.services.parameters import LIST_INTERVAL_US, Parameters
@@ -18,15 +18,15 @@ SHORTEST_INTERVAL_US = US_PER_MS
 LONGEST_INTERVAL_US = 2**31
 GREETED_US = {
     **dict.fromkeys(EXTRA, 1_000_000),
-    mavlink.LOCAL_POSITION: 250_000,
-    mavlink.GLOBAL_POSITION: 250_000,
+    frames.LOCAL_POSITION: 250_000,
+    frames.GLOBAL_POSITION: 250_000,
     mavlink.HOME_POSITION: 2_000_000,
 }
 """Intervals of the reports that start when a vehicle is greeted, unless they are already sent."""
 STREAMS: dict[int, tuple[int, ...]] = {
-    0: (*EXTRA, mavlink.LOCAL_POSITION, mavlink.GLOBAL_POSITION),
+    0: (*EXTRA, frames.LOCAL_POSITION, frames.GLOBAL_POSITION),
     2: (messages.SYS_STATUS, messages.GPS_RAW),
-    6: (mavlink.LOCAL_POSITION, mavlink.GLOBAL_POSITION),
+    6: (frames.LOCAL_POSITION, frames.GLOBAL_POSITION),
     10: (messages.ATTITUDE,),
     11: (messages.VFR_HUD,),
     12: (messages.BATTERY_STATUS, messages.EKF_STATUS),
@@ -86,10 +86,10 @@ class Services:
                     self._set(message_id, interval_us, time_ns)
             return []
         assert not isinstance(request, messages.SetMode)
-        frames = self.parameters.answer(request, self._encoder, counters)
+        answers = self.parameters.answer(request, self._encoder, counters)
         if self.parameters.listing:
             self._set(PARAMETER_VALUE, LIST_INTERVAL_US, time_ns)
-        return frames
+        return answers
 
     def next_parameter(self, time_ns: int) -> bytes:
         """The frame of the next parameter of a list, which is due now."""
@@ -160,7 +160,7 @@ class Services:
         return ACCEPTED, [messages.message_interval(message_id, interval_us)]
 
     def _set(self, message_id: int, interval_us: int, time_ns: int) -> None:
-        if message_id != mavlink.HEARTBEAT:
+        if message_id != frames.HEARTBEAT:
             time_ns = max(time_ns, self._reports_from_ns)
         self._schedule.set_interval(message_id, interval_us, time_ns)
 

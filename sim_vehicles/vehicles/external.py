@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import frames, mavlink
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
 from sim_vehicles.services.parameters import Parameters
@@ -99,7 +99,7 @@ class ExternallyFlown:
             type_mask=VELOCITY_ACCELERATION | YAW_IGNORED | YAW_RATE_IGNORED,
             target_system=0,
             target_component=0,
-            frame=mavlink.FRAME_LOCAL_NED,
+            frame=frames.LOCAL_NED,
         )
         if (craft.mode if isinstance(craft, Copter) else craft.flight.mode) != guided:
             craft.take_setpoint(setpoint, time_ns)  # PX4 enters OFFBOARD only while set-points arrive

@@ -14,9 +14,9 @@ import numpy as np
 from scenarios import schema
 from scenarios.kernel import Cell
 from scenarios.networks import wire_id
-from sim_vehicles.links.truth import ACTED, SAMPLED, Recorder, rows_of
+from sim_vehicles.links.truth import SAMPLED, Recorder, rows_of
 from sim_vehicles.motion.double_integrator import State
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import frames, mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
 from sim_vehicles.services.frames import FRAME_BYTES
@@ -97,15 +97,10 @@ class Radio:
         """Note a change, for whoever runs the simulation."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
-    def acted(self, setpoint_boot_ms: int, time_ns: int) -> None:
-        """Record in the truth log that a set-point acts from now on."""
+    def record(self, kind: int, boot_ms: int, time_ns: int) -> None:
+        """Record in the truth log that a set-point has ACTED, or that the state in a position report was SAMPLED."""
         if self.recorder is not None:
-            self.recorder.add((ACTED, self.system_id, setpoint_boot_ms, time_ns, time_ns, time_ns))
-
-    def sampled(self, boot_ms: int, time_ns: int) -> None:
-        """Record in the truth log when the state in a position report was sampled."""
-        if self.recorder is not None:
-            self.recorder.add((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
+            self.recorder.add((kind, self.system_id, boot_ms & frames.UINT32, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
         self.clock = clock
@@ -167,11 +162,11 @@ class Shell(Generic[Flown]):
         self._backdating_ns = backdating_ns(scenario, radio.system_id)
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule
-        schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
-        schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
-        intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
+        schedule.add_once(frames.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
+        schedule.set_interval(frames.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
+        intervals_us = {frames.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
         for message_id, interval_us in intervals_us.items():
-            begin_ns = radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
+            begin_ns = radio.start_ns if message_id == frames.HEARTBEAT else from_ns
             schedule.set_interval(message_id, interval_us, begin_ns)
         self.services = Services(
             radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
@@ -215,11 +210,11 @@ class Shell(Generic[Flown]):
                 self._report(*schedule.pop())
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
-        if self._speaks_version_1 and message_id != mavlink.HEARTBEAT:
+        if self._speaks_version_1 and message_id != frames.HEARTBEAT:
             return  # no station has been heard that could want it
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
-        if message_id == mavlink.TIMESYNC:
+        if message_id == frames.TIMESYNC:
             self._asked_ts1 = radio.clock.boot_ns(time_ns)
             frame = radio.encoder.timesync(0, self._asked_ts1)
         elif message_id == PARAMETER_VALUE:
@@ -229,8 +224,8 @@ class Shell(Generic[Flown]):
             if own is None:
                 return
             frame = mavlink.in_version_1(own) if self._speaks_version_1 else own
-            if message_id == mavlink.LOCAL_POSITION:
-                radio.sampled(boot_ms, time_ns)
+            if message_id == frames.LOCAL_POSITION:
+                radio.record(SAMPLED, boot_ms, time_ns)
         radio.send(frame, time_ns)
 
     def _reports_plainly(self, time_ns: int) -> bool:
@@ -281,7 +276,7 @@ class Shell(Generic[Flown]):
                 self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
 
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
-        if heartbeat.type != mavlink.TYPE_GCS:
+        if heartbeat.type != frames.STATION_TYPE:
             self.radio.counters["ignored_heartbeat"] += 1
         elif not self.authority.hears(source, time_ns):
             self.radio.counters["ignored_not_the_station"] += 1
