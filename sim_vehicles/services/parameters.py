@@ -122,14 +122,9 @@ def timeout(name: str, value_s: float) -> Parameter:
     return Parameter(name, value_s, min(low, value_s), max(high, value_s))
 
 
-def fixed(name: str, value: int) -> Parameter:
-    """A whole number that cannot be changed in flight."""
-    return Parameter(name, value, value, value, whole=True)
-
-
-def limit(name: str, value: float) -> Parameter:
-    """A limit of the vehicle's motion, which cannot be changed in flight."""
-    return Parameter(name, value, value, value)
+def fixed(name: str, value: float) -> Parameter:
+    """A parameter that cannot be changed in flight, such as a limit of the vehicle's motion."""
+    return Parameter(name, value, value, value, whole=isinstance(value, int))
 
 
 _ARDUPILOT_VALUES: dict[str, float] = {
