@@ -300,8 +300,10 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
             wanted = "no such key with natural_frequency_rad_s: one model at a time"
             yield f"{key}.dead_time_s", part.dead_time_s, wanted
     if scenario.dynamics == "autopilot":
-        if scenario.altitude_m == 0:
-            yield "altitude_m", scenario.altitude_m, "an altitude above 0 to take off to, with dynamics autopilot"
+        for k, vehicle in enumerate(scenario.vehicles):
+            if scenario.altitude_of(vehicle) == 0:
+                key = "altitude_m" if vehicle.altitude_m is None else f"vehicles[{k}].altitude_m"
+                yield key, 0, "an altitude above 0 to take off to, with dynamics autopilot"
         return
     for k, vehicle in enumerate(scenario.vehicles):
         if vehicle.flavour is not None:

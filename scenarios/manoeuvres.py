@@ -16,11 +16,6 @@ def contradictions(scenario: Scenario) -> Iterator[Fault]:
     yield from _course_contradictions(scenario)
     yield from _leader_contradictions(scenario)
     yield from _change_contradictions(scenario)
-    if not scenario.has_altitude_slots or scenario.dynamics != "autopilot":
-        return
-    for k, vehicle in enumerate(scenario.vehicles):
-        if vehicle.altitude_m == 0:
-            yield f"vehicles[{k}].altitude_m", 0, "an altitude above 0 to take off to, with dynamics autopilot"
 
 
 def _waypoint_contradictions(scenario: Scenario) -> Iterator[Fault]:
