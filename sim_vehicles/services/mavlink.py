@@ -67,12 +67,12 @@ class Setpoint(NamedTuple):
     time_boot_ms: int
     velocity_ned_m_s: Triple
     acceleration_ned_m_s2: Triple
-    yaw_rad: float
-    yaw_rate_rad_s: float
-    type_mask: int
-    target_system: int
-    target_component: int
-    frame: int
+    yaw_rad: float = 0.0
+    yaw_rate_rad_s: float = 0.0
+    type_mask: int = 0
+    target_system: int = 0
+    target_component: int = 0
+    frame: int = LOCAL_NED
 
 
 class Command(NamedTuple):
@@ -252,10 +252,10 @@ class Encoder:
         return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
 
     def frame(self, number: int, payload: bytes) -> bytes:
-        """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
+        """The frame of a frequent message, without pymavlink's objects."""
         self._frame[frames.PAYLOAD : frames.PAYLOAD + len(payload)] = np.frombuffer(payload, np.uint8)
         self._frame[1], self._frame[7] = len(payload), number
-        return self._made(_finish_at, CRC_EXTRA[number][0])
+        return self._made(_finish_at)
 
     def _made(self, make: Callable[..., int], *values: float) -> bytes:
         """The frame that a kernel makes from these values."""

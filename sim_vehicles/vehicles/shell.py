@@ -6,8 +6,8 @@ time, however late `step` is called.
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -21,12 +21,12 @@ from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
 from sim_vehicles.services.frames import FRAME_BYTES
 from sim_vehicles.services.hot import COUNTED, Place, new_vehicles, place_in
-from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMode
+from sim_vehicles.services.messages import EXTRA, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
 from sim_vehicles.services.services import Services
 from sim_vehicles.services.sitl import backdating_ns
-from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, UNUSUAL, hear_at, report_at
+from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, hear_at, report_at
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
@@ -164,7 +164,7 @@ class Shell(Generic[Flown]):
         self._schedule = schedule = radio.schedule
         schedule.add_once(frames.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
         schedule.set_interval(frames.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
-        intervals_us = {frames.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
+        intervals_us = {**dict.fromkeys(EXTRA, 0), frames.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
         for message_id, interval_us in intervals_us.items():
             begin_ns = radio.start_ns if message_id == frames.HEARTBEAT else from_ns
             schedule.set_interval(message_id, interval_us, begin_ns)
@@ -206,7 +206,7 @@ class Shell(Generic[Flown]):
                 craft.happen(deadline_ns)
             elif scheduled_ns >= end_ns:
                 return
-            elif not self._reports_plainly(scheduled_ns):
+            elif not (craft.is_plain and self._runs_plainly(report_at, scheduled_ns)):
                 self._report(*schedule.pop())
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
@@ -217,7 +217,7 @@ class Shell(Generic[Flown]):
         if message_id == frames.TIMESYNC:
             self._asked_ts1 = radio.clock.boot_ns(time_ns)
             frame = radio.encoder.timesync(0, self._asked_ts1)
-        elif message_id == PARAMETER_VALUE:
+        elif message_id == frames.PARAMETER_VALUE:
             frame = self.services.next_parameter(time_ns)
         else:
             own = craft.report(message_id, time_ns, boot_ms)
@@ -228,37 +228,23 @@ class Shell(Generic[Flown]):
                 radio.record(SAMPLED, boot_ms, time_ns)
         radio.send(frame, time_ns)
 
-    def _reports_plainly(self, time_ns: int) -> bool:
-        """Send the due report from a kernel, if possible; returns whether it was sent."""
+    def _runs_plainly(self, run: Callable[..., int], time_ns: int, *heard: Any) -> bool:
+        """Run an event of a plain craft, a report or what is heard, in a kernel; False if it is unusual."""
         radio, (vehicles, _, row) = self.radio, self.radio.place
-        size = report_at(vehicles, row, self._frames, radio.truth_rows) if self.craft.is_plain else UNUSUAL
-        if size == MOVE_FIRST:
-            self.craft.move(time_ns)
-            size = report_at(vehicles, row, self._frames, radio.truth_rows)
-        if size == UNUSUAL:
-            return False
-        radio.send(self._frames[1, :size].tobytes(), time_ns)
-        return True
-
-    def _hears_plainly(self, data: bytes, time_ns: int) -> bool:
-        """Act on a datagram in a kernel, if possible; returns whether it did."""
-        if not self.craft.is_plain or len(data) > FRAME_BYTES:
-            return False
-        radio, (vehicles, _, row) = self.radio, self.radio.place
-        received = np.frombuffer(data, np.uint8)
-        size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
+        arguments = vehicles, row, *heard, self._frames, radio.truth_rows
+        size = run(*arguments)
         if size == MOVE_FIRST:
             self.craft.move(self.craft.acts_at(time_ns))
-            size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
-        if size == UNUSUAL:
-            return False
-        if size != SILENT:
+            size = run(*arguments)
+        if size > SILENT:
             radio.send(self._frames[1, :size].tobytes(), time_ns)
-        return True
+        return size >= SILENT
 
     def _receive(self, data: bytes, time_ns: int) -> None:
-        if self._hears_plainly(data, time_ns):
-            return
+        if self.craft.is_plain and len(data) <= FRAME_BYTES:
+            received = np.frombuffer(data, np.uint8)
+            if self._runs_plainly(hear_at, time_ns, received, time_ns):
+                return
         counters, authority = self.radio.counters, self.authority
         for source, message in mavlink.read_datagram(data, counters):
             self._speaks_version_1 = False
