@@ -101,11 +101,8 @@ class SignedLink:
                 refused[TRUNCATED] += 1
                 break
             frame = datagram[at:stop]
-            reason = self._fault(frame)
-            if not reason and unwanted is not None:
-                reason = unwanted(frame[5])
-            if not reason:
-                reason = self._staleness(frame, now_ns)
+            reason = self._fault(frame) or (unwanted(frame[5]) if unwanted is not None else "")
+            reason = reason or self._staleness(frame, now_ns)
             if reason:
                 refused[reason] += 1
             else:
