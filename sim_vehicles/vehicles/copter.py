@@ -15,7 +15,7 @@ from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import ACTED
 from sim_vehicles.motion.air import Air
-from sim_vehicles.motion.copter import Motion, Target, advance, shifted
+from sim_vehicles.motion.copter import Motion, Target, advance, pushed
 from sim_vehicles.motion.double_integrator import State, state_from
 from sim_vehicles.motion.lagged import inner_of
 from sim_vehicles.motion.navigation import Navigator
@@ -338,15 +338,10 @@ class Copter:
         """Motion and target at a later time."""
         if self._air is None:
             return advance(self.motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
-
-        def move(own: tuple[Motion, Target], duration_s: float) -> tuple[Motion, Target]:
-            return advance(*own, self.settings, duration_s)
-
-        def shift(own: tuple[Motion, Target], *by: float) -> tuple[Motion, Target]:
-            return shifted(own[0], *by), own[1]
-
         own = self.motion, self._target
-        return self._air.moved(own, move, shift, self._motion_ns, time_ns, foreseen=foreseen)
+        for piece in self._air.pieces(self._motion_ns, time_ns, foreseen=foreseen):
+            own = pushed(*own, self.settings, piece)
+        return own
 
     def move(self, time_ns: int) -> None:
         if time_ns <= self._motion_ns:

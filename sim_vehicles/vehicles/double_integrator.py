@@ -282,7 +282,7 @@ class DoubleIntegrator:
             place, velocity = state[0:2], state.velocity_ne_m_s()
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
-            climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
+            climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.attitude()[:2]
             down_m_s = 0.0 - climb_m_s  # not -0.0, whose sign bit would be sent
             return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
         if message_id in (mavlink.POSITION_TARGET, messages.NAMED_INT):
@@ -350,12 +350,11 @@ class DoubleIntegrator:
 
     def _moved(self, own: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
         """The state at a later time in flight, by its own motion and what the air adds."""
-        command = self._command
-
-        def move(state: State, duration_s: float) -> State:
-            return own(state, command, self._bounds, duration_s)
-
-        return air.moved(self._state, move, motion.shifted, self._state_ns, time_ns, foreseen=foreseen)
+        state, command = self._state, self._command
+        for t, half_north, half_east, north, east in air.pieces(self._state_ns, time_ns, foreseen=foreseen):
+            pushed = motion.shifted(state, 0.0, 0.0, half_north, half_east)
+            state = motion.shifted(own(pushed, command, self._bounds, t), north, east, half_north, half_east)
+        return state
 
     def _note_fault(self, text: str) -> None:
         """Count a step in which the user's own dynamics failed, and report the first."""
