@@ -273,16 +273,14 @@ def rehearsal(system_id: int) -> list[bytes]:
     """Frames with which a station prepares a vehicle for flight, and its first set-points."""
     system_id = wire_id(system_id)
     station = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    none = 0.0
+    command: Any = dialect.MAVLink_command_long_message
+    zeros = (0.0,) * 6
     messages = (
         dialect.MAVLink_heartbeat_message(STATION_TYPE, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3),
         dialect.MAVLink_timesync_message(0, 1),
-        dialect.MAVLink_command_long_message(
-            system_id, 1, COMMAND_MODE, 0, BASE_MODE_CUSTOM, MODE_GUIDED, none, none, none, none, none
-        ),
-        dialect.MAVLink_command_long_message(system_id, 1, COMMAND_ARM, 0, 1.0, none, none, none, none, none, none),
+        command(system_id, 1, COMMAND_MODE, 0, BASE_MODE_CUSTOM, MODE_GUIDED, *zeros[1:]),
+        command(system_id, 1, COMMAND_ARM, 0, 1.0, *zeros),
     )
     set_point: Any = dialect.MAVLink_set_position_target_local_ned_message
-    zeros = (none,) * 6
-    flown = [set_point(ms, system_id, 1, LOCAL_NED, 0x0C3F, *zeros, 0.5, -0.5, none, none, none) for ms in (1, 2)]
+    flown = [set_point(ms, system_id, 1, LOCAL_NED, 0x0C3F, *zeros, 0.5, -0.5, *zeros[:3]) for ms in (1, 2)]
     return [message.pack(station) for message in (*messages, *flown)]

@@ -20,7 +20,7 @@ from sim_vehicles.services import frames, mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
 from sim_vehicles.services.frames import FRAME_BYTES
-from sim_vehicles.services.hot import COUNTED, Place, new_vehicles, place_in
+from sim_vehicles.services.hot import COUNTED, Place, new_place
 from sim_vehicles.services.messages import EXTRA, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
@@ -61,7 +61,7 @@ class Radio:
         recorder: Recorder | None = None,
         place: Place | None = None,
     ) -> None:
-        self.place = place or place_in(new_vehicles(1))
+        self.place = place or new_place()
         for name, number in (("system_id", own.system_id), ("wire_id", wire_id(own.system_id))):
             self.place.columns[name][self.place.row] = number
         self.system_id = own.system_id
