@@ -49,9 +49,10 @@ def mismatch_window(
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     The first is 0 if the loop is stable down to zero delay, the second `inf` if no upper limit is found; both are
-    `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s,
-    each confirmed on either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map
-    is large. Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
+    `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, or
+    to the q-th root of 1e-14 at a q-fold eigenvalue, as of q equal followers in mixed coordinates. Each is confirmed on
+    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large. Between
+    them the window is a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay of the prediction.
