@@ -20,6 +20,7 @@ from gains.core.structure import (
     block_diagonal,
     distinct_blocks,
     is_singular_for_any_delay,
+    of_type,
     without_equilibria,
 )
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
@@ -111,6 +112,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
     >>> round(found.delay_margin_s, 6), found.checked_by
     (1.570796, ('sweep', 'rightmost root'))
     """
+    of_type("model", model, DelayModel, HeldModel)
     if isinstance(model, HeldModel):
         return _with_unknown_period(model) if model.period_s is None else _with_known_period(model, model.period_s)
     return _with_unknown_delay(model) if model.unknown else _at_given_delays(model)

@@ -86,8 +86,8 @@ def test_error_of_a_margin_of_too_large_a_map_is_not_known() -> None:
 @pytest.mark.parametrize("across", [3, 5, 8])
 @pytest.mark.parametrize("share", [2.0**-16, 2.0**-19, 2.0**-25])
 def test_error_bounds_a_period_beside_a_double_eigenvalue(across: int, share: float) -> None:
-    # p'' = -k p - p' held for T has a pair on the circle at T = 2 / k; with k = 1 it is double, at z = -1. Whole numbers
-    # of determinant one mix the states without rounding.
+    # p'' = -k p - p' held for T has a pair on the circle at T = 2 / k; with k = 1 it is double, at z = -1. Whole
+    # numbers of determinant one mix the states without rounding.
     mixed = np.array([[1.0, across], [12.0, 1.0 + 12.0 * across]])
     back = np.array([[1.0 + 12.0 * across, -across], [-12.0, 1.0]])
     k = 1.0 + share

@@ -156,7 +156,7 @@ def test_equal_followers_in_mixed_coordinates_have_the_window_of_one(
     K = together[2] + np.kron(np.eye(followers, k=-1), [[0.2, 0.5]])
     mixed = np.linalg.qr(np.random.default_rng(1).standard_normal((2 * followers, 2 * followers)))[0]
     loop = mixed @ together[0] @ mixed.T, mixed @ together[1], K @ mixed.T
-    # a chain: one eigenvalue of this multiplicity, which rounding of 1e-14 spreads by its root; twice that, as the gains
-    # between followers are not one
+    # a chain: one eigenvalue of this multiplicity, which rounding of 1e-14 spreads by its root; twice that, as the
+    # gains between followers are not one
     within = 2.0 * 1e-14 ** (1.0 / followers)
     assert mismatch_window(*loop, rates, assumed_s=assumed_s) == pytest.approx(alone_s, rel=within)
