@@ -29,6 +29,8 @@ _FRACTIONS = 8
 _REFINEMENTS = (1, 4, 16)
 # turns of a locus that are tried at the finer fractions: angles of a twentieth of a period meet a whole q in about 20
 _TURNS = 40
+# loci below this at eight fractions do not reach one between them
+_SMALL = 0.8
 # one-period maps larger than this are not checked by eigenvalues: each takes 20 ms or more
 _LARGEST_CHECK = 120
 # fractions of the margin at which it is checked: the radius changes by about a part in 10^6, its error is 1e-12
@@ -66,9 +68,20 @@ def block_delay_margin(plant: SampledPlant) -> float:
         margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
         contradiction = _contradiction(plant, margin_s)
         # angles may also exist between two fractions only, for a loop that is unstable at long delays alone
-        if not contradiction and (margin_s < inf or refinement == _REFINEMENTS[-1]):
+        if not contradiction and (margin_s < inf or refinement == _REFINEMENTS[-1] or _has_small_loci(plant)):
             return float(margin_s)
     raise DisagreementError(contradiction)
+
+
+def _has_small_loci(plant: SampledPlant) -> bool:
+    """Whether every locus stays far below one: looks at finer fractions would find no angle."""
+    angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
+    angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
+    loops = (
+        delay_loci(F, G, plant.K, D) for F, G, D in (_tustin(plant, k / _FRACTIONS) for k in range(_FRACTIONS + 1))
+    )
+    omega = np.tan(angle / 2.0) * 2.0 / plant.period_s
+    return all(float(np.abs(loci(omega)).max()) < _SMALL for loci in loops)
 
 
 def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> float:
