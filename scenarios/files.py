@@ -63,20 +63,18 @@ def parse(text: str, file: Path) -> Scenario:
     try:
         # Strict validation accepts lists as tuples only from JSON text, in which a TOML date is a string.
         scenario = Scenario.model_validate_json(to_json(data))
-    except ValidationError as errors:
-        raise _at_line(file, text, data, *_first_error(errors, data)) from None
-    if scenario.code:
-        raise _at_line(
-            file, text, data, "code", InWords("tables"), "no such key: files of code are named by other keys"
-        )
-    for key, read, wanted in _contradictions(scenario):
-        raise _at_line(file, text, data, key, read, wanted)
-    try:
+        if scenario.code:
+            wanted = "no such key: files of code are named by other keys"
+            raise ScenarioError(file, "code", InWords("tables"), wanted)
+        scenario = checked(scenario, file)
         if scenario.links.profile is not None:
             scenario = with_profile(scenario, scenario.links.profile, file)
         return with_code(with_traces(scenario, file), file)
+    except ValidationError as errors:
+        key, read, wanted = _first_error(errors, data)
     except ScenarioError as error:
-        raise _at_line(file, text, data, error.place, error.read, error.wanted) from None
+        key, read, wanted = error.place, error.read, error.wanted
+    raise ScenarioError(file, place_of(key, text, data), read, wanted)
 
 
 def with_profile(scenario: Scenario, name: str, file: Path, key: str = "links.profile") -> Scenario:
@@ -125,11 +123,6 @@ def fingerprint(scenario: Scenario) -> str:
     return hashlib.sha256(flown.encode()).hexdigest()[:16]
 
 
-def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
-    """The error, with the key's line in the file, and the system id in place of a vehicle's index."""
-    return ScenarioError(file, place_of(key, text, data), read, wanted)
-
-
 def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, object, str]:
     """The first of pydantic's errors: key, what was read, what was wanted."""
     # a misspelt key explains the missing one
@@ -175,7 +168,7 @@ def _value_at(data: Any, location: tuple[int | str, ...]) -> Any:
 
 
 def _contradictions(scenario: Scenario) -> Iterator[Fault]:
-    """Faults that no single key shows."""
+    """Faults that no single key shows. Only the first counts: a check may rely on those before it."""
     yield from _formation_contradictions(scenario)
     yield from manoeuvre_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
@@ -203,11 +196,8 @@ def _control_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if control.gains is not None and required:
         yield "control.gains", control.gains.model_dump(), f"either gains or a requirement ({wanted})"
     if control.blocks and (required or control.gains is not None):
-        yield (
-            "control.blocks",
-            InWords(f"{len(control.blocks)} blocks"),
-            f"either blocks, or gains, or a requirement ({wanted})",
-        )
+        read = InWords(f"{len(control.blocks)} blocks")
+        yield "control.blocks", read, f"either blocks, or gains, or a requirement ({wanted})"
     if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
         wanted = "inclusion without blocks, with dynamics autopilot: margins with a lag are computed only for its gains"
         yield "control.method", control.method, wanted
@@ -244,8 +234,8 @@ def _block_contradictions(scenario: Scenario) -> Iterator[Fault]:
         for name, system_id in (("vehicle", block.vehicle), ("of", block.of)):
             if system_id not in columns:
                 yield f"control.blocks[{k}].{name}", system_id, _A_VEHICLE
-        count = columns.get(block.of)
-        if count is not None and any(len(row) != count for row in block.gain):
+        count = columns[block.of]
+        if any(len(row) != count for row in block.gain):
             wanted = f"two rows of {count} numbers, as vehicle {block.of} {'leads' if count == 2 else 'follows'}"
             yield f"control.blocks[{k}].gain", [list(row) for row in block.gain], wanted
         if (block.vehicle, block.of) in seen:
@@ -297,9 +287,8 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[Fault]:
         read = InWords(f"a cycle: {' follows '.join(map(str, cycle))}")
         yield f"vehicles[{system_ids.index(cycle[0])}].follows", read, wanted
     if len(leaders) != 1:
-        key = f"vehicles[{system_ids.index(leaders[-1])}].follows" if leaders else "vehicles.follows"
         read = InWords(f"vehicles without it: {leaders}")
-        yield key, read, "exactly one vehicle without it, the leader"
+        yield f"vehicles[{system_ids.index(leaders[-1])}].follows", read, "exactly one vehicle without it, the leader"
 
 
 def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
@@ -322,15 +311,16 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
 
 
 def _take_off_contradictions(scenario: Scenario) -> Iterator[Fault]:
-    if not scenario.altitude_m or "altitude_m" not in scenario.model_fields_set:
-        read = scenario.altitude_m if "altitude_m" in scenario.model_fields_set else InWords("no such key")
-        yield "altitude_m", read, "an altitude above 0 to take off to, with dynamics autopilot"
-        return
     climb_m_s, patience_s = scenario.autopilot.climb_max_m_s, scenario.safety.ready_patience_s
+    reached = f"autopilot.climb_max_m_s = {climb_m_s:g} reaches in safety.ready_patience_s = {patience_s:g}"
     for k, vehicle in enumerate(scenario.vehicles):
-        if (altitude_m := scenario.altitude_of(vehicle)) > climb_m_s * patience_s:
-            key = "altitude_m" if vehicle.altitude_m is None else f"vehicles[{k}].altitude_m"
-            reached = f"autopilot.climb_max_m_s = {climb_m_s:g} reaches in safety.ready_patience_s = {patience_s:g}"
+        key, altitude_m = f"vehicles[{k}].altitude_m", vehicle.altitude_m
+        if altitude_m is None:
+            key, altitude_m = "altitude_m", scenario.altitude_m if "altitude_m" in scenario.model_fields_set else None
+        if not altitude_m:
+            read = InWords("no such key") if altitude_m is None else altitude_m
+            yield key, read, "an altitude above 0 to take off to, with dynamics autopilot"
+        elif altitude_m > climb_m_s * patience_s:
             yield key, altitude_m, f"at most {climb_m_s * patience_s:g}, which {reached}"
 
 

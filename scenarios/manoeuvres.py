@@ -16,11 +16,6 @@ def contradictions(scenario: Scenario) -> Iterator[Fault]:
     yield from _course_contradictions(scenario)
     yield from _leader_contradictions(scenario)
     yield from _change_contradictions(scenario)
-    if not scenario.has_altitude_slots or scenario.dynamics != "autopilot":
-        return
-    for k, vehicle in enumerate(scenario.vehicles):
-        if vehicle.altitude_m == 0:
-            yield f"vehicles[{k}].altitude_m", 0, "an altitude above 0 to take off to, with dynamics autopilot"
 
 
 def _waypoint_contradictions(scenario: Scenario) -> Iterator[Fault]:
@@ -33,17 +28,11 @@ def _waypoint_contradictions(scenario: Scenario) -> Iterator[Fault]:
             yield "course.speed_m_s", course.speed_m_s, "no such key without course.waypoints_ne_m"
         return
     if scenario.nominal_velocity:
-        yield (
-            "nominal_velocity",
-            InWords(f"{len(scenario.nominal_velocity)} entries"),
-            "none with course.waypoints_ne_m",
-        )
+        read = InWords(f"{len(scenario.nominal_velocity)} entries")
+        yield "nominal_velocity", read, "none with course.waypoints_ne_m"
     if len(points) < 2 or any(a == b for a, b in pairwise(points)):
-        yield (
-            "course.waypoints_ne_m",
-            [list(point) for point in points],
-            "two places or more, each unlike the one before",
-        )
+        wanted = "two places or more, each unlike the one before"
+        yield "course.waypoints_ne_m", [list(point) for point in points], wanted
     lowest, highest = limits.speed_min_m_s, limits.speed_max_m_s or math.inf
     for key, value in (("speed_m_s", course.speed_m_s), ("acceleration_max_m_s2", course.acceleration_max_m_s2)):
         if value is None:
@@ -60,10 +49,6 @@ def _course_contradictions(scenario: Scenario) -> Iterator[Fault]:
             if value not in (None, "fixed"):
                 yield f"course.{key}", value, "no such key without course.acceleration_max_m_s2"
         return
-    if bool(course.waypoints_ne_m) != (course.speed_m_s is not None) or not (
-        course.waypoints_ne_m or scenario.nominal_velocity
-    ):
-        return  # reported above
     try:
         changes = scenario.smooth_course().changes
     except TooShortError as error:
@@ -83,11 +68,8 @@ def _leader_contradictions(scenario: Scenario) -> Iterator[Fault]:
         return
     key, control = "course.leader", scenario.control
     if control.loop == "onboard" or control.prediction != "off":
-        yield (
-            key,
-            "external",
-            "station, with loop onboard or with prediction: both need the nominal velocity beforehand",
-        )
+        wanted = "station, with loop onboard or with prediction: both need the nominal velocity beforehand"
+        yield key, "external", wanted
     if control.method != "inclusion" or control.blocks:
         yield key, "external", "station, with gains on a graph: only inclusion gains are flown behind another's leader"
     if scenario.course.offsets == "heading":

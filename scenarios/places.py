@@ -93,11 +93,7 @@ def named(key: str, data: Mapping[str, Any]) -> str:
 
 _WANTED = {
     "int_type": "an integer",
-    "int_from_float": "an integer",
-    "int_parsing": "an integer",
-    "int_parsing_size": "an integer of fewer digits",
     "float_type": "a number",
-    "float_parsing": "a number",
     "finite_number": "a finite number",
     "bool_type": "true or false",
     "string_type": "text in quotes",
@@ -111,8 +107,6 @@ _WANTED = {
     "too_long": "a list of at most {max_length}, not {actual_length}",
     "tuple_type": "a list in brackets",
     "model_type": "a table of keys",
-    "model_attributes_type": "a table of keys",
-    "dict_type": "a table of keys",
     "system_id": "at most 250, or 1001 to 1250 in network 1, 2001 to 2250 in network 2, and so on",
     "dynamics": "double_integrator, autopilot, jsbsim, jsbsim:MODEL, or FILE.py:NAME",
     "prediction": "off, measured, or a number of seconds greater than 0, at most {most:g}",

@@ -363,12 +363,16 @@ class Scenario(Part):
 
     def link_of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of one vehicle."""
-        return self.links.of(system_id)
+        links = self.links
+        for own in links.vehicles:
+            if own.system_id == system_id:
+                return own.up or links.up, own.down or links.down
+        return links.up, links.down
 
     def nominal_velocity_at(self, time_s: float) -> Velocity:
         """v_d at a scenario time; before time zero it is that at time zero."""
         if self.course.is_smooth:
-            return self.smooth_course().velocity_at(time_s)
+            return self.smooth_course().at(time_s).velocity_ne_m_s
         current = self.nominal_velocity[0]
         for entry in self.nominal_velocity:
             if entry.from_s <= time_s:

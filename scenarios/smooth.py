@@ -105,10 +105,6 @@ class SmoothCourse:
         k = bisect_right(self._from_s, time_s) - 1
         return self._start if k < 0 else self.changes[k].at(time_s)
 
-    def velocity_at(self, time_s: float) -> Vector:
-        """v_d at a scenario time, north and east in m/s."""
-        return self.at(time_s).velocity_ne_m_s
-
 
 class Bounds(NamedTuple):
     """Bounds on changes of the nominal velocity; None is no bound."""

@@ -6,12 +6,12 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
-from numbers import Real
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from gains.core.errors import BadModelError
+from gains.core.structure import is_number, of_type, shown
 
 DEFAULT_DELAY_MARGIN_S = 0.3
 # below this α, and above this margin, the numbers in a proof span too many decades for the solver
@@ -108,7 +108,7 @@ _POSITIVE = (
 def _check_positive(record: object, names: Iterable[str]) -> None:
     for name in names:
         wanted = getattr(record, name)
-        if wanted is not None and not (isinstance(wanted, Real) and 0.0 < float(wanted) < inf):
+        if wanted is not None and not (is_number(wanted) and 0.0 < wanted < inf):
             raise BadModelError(f"{name} = {wanted}; wanted a positive number")
 
 
@@ -154,15 +154,17 @@ class Requirement:
             raise BadModelError(f"delay_margin_s = {self.delay_margin_s}; wanted at most {DELAY_MARGIN_MAX_S} s")
         if self.alpha is not None and self.alpha < ALPHA_MIN:
             raise BadModelError(f"alpha = {self.alpha}; wanted at least {ALPHA_MIN}")
-        if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
-            raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
-        if self.loop not in ("ground", "onboard"):
+        limit = self.string_peak_max
+        if limit is not None and not (is_number(limit) and 1.0 <= limit < inf):
+            raise BadModelError(f"string_peak_max = {shown(limit)}; wanted a number of at least 1")
+        if of_type("loop", self.loop, str) not in ("ground", "onboard"):
             raise BadModelError(f"loop = {self.loop!r}; wanted ground or onboard")
-        if not 0.0 <= self.feed_forward <= 1.0:
-            raise BadModelError(f"feed_forward = {self.feed_forward}; wanted a number from 0 to 1")
+        if not (is_number(self.feed_forward) and 0.0 <= self.feed_forward <= 1.0):
+            raise BadModelError(f"feed_forward = {shown(self.feed_forward)}; wanted a number from 0 to 1")
         if self.feed_forward and (self.loop == "onboard" or self.criteria is not None):
             raise BadModelError(f"feed_forward = {self.feed_forward}; wanted 0 with criteria or the onboard loop")
-        given = (self.delay_margin_s, self.alpha, self.decay_rate_1_s, self.criteria and self.criteria.at_delay_s)
+        at_delay_s = None if self.criteria is None else of_type("criteria", self.criteria, Criteria).at_delay_s
+        given = (self.delay_margin_s, self.alpha, self.decay_rate_1_s, at_delay_s)
         if all(wanted is None for wanted in given):
             object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
 

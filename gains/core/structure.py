@@ -11,14 +11,21 @@ import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
-from math import log2
+from math import inf, log2
 from numbers import Real
+from sys import float_info
+from typing import TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import ComplexArray, FloatArray, IntArray, RealArray
 from gains.core.errors import BadModelError
+
+# longer texts are truncated in messages
+_SHOWN = 60
+
+_Any = TypeVar("_Any")
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
     """`value` as a matrix of finite real numbers with at least one entry; BadModelError names it otherwise."""
     try:
         matrix = np.array(value)
-    except ValueError as error:
+    except (OverflowError, ValueError) as error:
         raise BadModelError(f"{name} is ragged; rows of equal length are wanted") from error
     if matrix.dtype.kind not in "fiub":
         raise BadModelError(f"{name} has entries of type {matrix.dtype}; real numbers are wanted")
@@ -68,20 +75,46 @@ def positive_seconds(name: str, value: float) -> float:
 
 def positive_number(name: str, value: float, what: str = "number") -> float:
     """`value` if it is positive and finite; otherwise BadModelError says that a positive `what` is wanted."""
-    if not (isinstance(value, Real) and np.isfinite(value) and value > 0.0):
-        raise BadModelError(f"{name} is {_shown(value)}; a positive {what} is wanted")
+    if not (is_number(value) and 0.0 < value < inf):
+        raise BadModelError(f"{name} is {shown(value)}; a positive {what} is wanted")
     return float(value)
 
 
 def seconds(name: str, value: float) -> float:
     """`value` if it is finite and not negative; BadModelError names it otherwise."""
-    if not (isinstance(value, Real) and np.isfinite(value) and value >= 0.0):
-        raise BadModelError(f"{name} is {_shown(value)}; a number of seconds >= 0 is wanted")
+    if not (is_number(value) and 0.0 <= value < inf):
+        raise BadModelError(f"{name} is {shown(value)}; a number of seconds >= 0 is wanted")
     return float(value)
 
 
-def _shown(value: object) -> str:
-    return str(value) if isinstance(value, Real) else repr(value)
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether `value` is a real number that a float can hold, perhaps infinite, but not nan.
+
+    >>> [is_number(value) for value in (2, float("inf"), 10**400, float("nan"), "2", None, [2.0])]
+    [True, True, False, False, False, False, False]
+    """
+    return isinstance(value, Real) and (abs(value) <= float_info.max or abs(value) == inf)  # type: ignore[operator]
+
+
+def of_type(name: str, value: _Any, *kinds: type) -> _Any:
+    """`value` if it is of one of the kinds; BadModelError says what was read and which is wanted.
+
+    >>> of_type("assumed_s", 0.1, int, float)
+    0.1
+    """
+    if not isinstance(value, kinds):
+        raise BadModelError(f"{name} is {shown(value)}; a {' or '.join(kind.__name__ for kind in kinds)} is wanted")
+    return value
+
+
+def shown(value: object) -> str:
+    """The value in one short line, for a message.
+
+    >>> shown(0.1), shown("0.1"), shown(np.zeros((2, 1)))
+    ('0.1', "'0.1'", 'array([[0.], [0.]])')
+    """
+    text = " ".join((str(value) if isinstance(value, Real) else repr(value)).split())
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:

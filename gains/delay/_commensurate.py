@@ -247,12 +247,9 @@ def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 
 def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
-    """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta; all slopes are 0 if any A is defective."""
+    """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta, huge for defective eigenvalues."""
     roots, right = np.linalg.eig(at_angle(terms, theta))
-    try:
-        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, at_angle(terms, theta, 1) @ right)))
-    except np.linalg.LinAlgError:
-        slopes = np.zeros(roots.shape)
+    slopes = np.real(np.einsum("tii->ti", solved_beside_poles(right, at_angle(terms, theta, 1) @ right)))
     return roots.astype(np.complex128), slopes.astype(np.float64)
 
 

@@ -11,7 +11,7 @@ problems and matrix pencil methods for stability of delay-differential equations
 from numpy.typing import ArrayLike
 
 from gains.core.errors import BadModelError
-from gains.core.structure import distinct_blocks, square_matrices
+from gains.core.structure import distinct_blocks, is_number, shown, square_matrices
 from gains.delay._commensurate import analyse_block
 from gains.delay._crossings import Crossing
 from gains.delay._windows import DelayAnalysis, combined_analysis
@@ -42,8 +42,8 @@ def analyse_delay(
     [(0.1002, 1.7179)]
     """
     blocks = distinct_blocks(*square_matrices(**{f"A{k}": matrix for k, matrix in enumerate((A0, A1, *further))}))
-    if horizon_s is not None and not horizon_s > 0.0:
-        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
+    if horizon_s is not None and not (is_number(horizon_s) and horizon_s > 0.0):
+        raise BadModelError(f"horizon_s is {shown(horizon_s)}; a positive number of seconds is wanted")
     return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import distinct_blocks, real_matrix, square_matrices
+from gains.core.structure import distinct_blocks, of_type, real_matrix, square_matrices
 from gains.delay._curves import at_delay, crossing_solutions
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
@@ -70,7 +70,8 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
     ([1.570796, 0.785398], True)
     """
-    now, *delayed = square_matrices(A0=A0, **{f"late[{k}]": matrix for k, matrix in enumerate(late)})
+    listed = list(of_type("late", late, Sequence, np.ndarray))
+    now, *delayed = square_matrices(A0=A0, **{f"late[{k}]": matrix for k, matrix in enumerate(listed)})
     limits_s = [inf] * len(delayed)
     coupled: list[frozenset[int]] = []
     for block in distinct_blocks(now, *delayed):

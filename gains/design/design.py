@@ -9,6 +9,7 @@ Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
 
 from dataclasses import asdict, dataclass
+from types import NoneType
 from typing import Any, Literal, get_args, overload
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
-from gains.core.structure import positive_seconds
+from gains.core.structure import of_type, positive_seconds, shown
 from gains.criteria.predicted import fed_forward
 from gains.delay.constant import delay_margin
 from gains.design.for_delay import criteria_gains
@@ -132,7 +133,12 @@ def design(
     >>> round(found.delay_margin_s, 4), found.K1.shape
     (0.3, (2, 2))
     """
-    if method not in (known := ("inclusion", *get_args(GraphMethod))):
+    of_type("formation", formation, FormationModel)
+    of_type("requirement", requirement, Requirement, NoneType)
+    of_type("pattern", pattern, Pattern, NoneType)
+    of_type("onboard", onboard, OnboardTiming, NoneType)
+    known = "inclusion", *get_args(GraphMethod)
+    if of_type("method", method, str) not in known:
         raise BadModelError(f"method = {method!r}; wanted {', '.join(known[:-1])} or {known[-1]}")
     positive_seconds("period_s", period_s)
     if method != "inclusion":
@@ -189,11 +195,17 @@ def evaluate_gains(
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
     """
+    of_type("formation", formation, FormationModel)
     Requirement(feed_forward=feed_forward)  # checks the range
+    of_type("pattern", pattern, Pattern, NoneType)
     if pattern is not None:
         return assess(formation, pattern, checked_pattern_gain(pattern, gains), period_s=period_s)
+    try:
+        K1, K2, K3 = gains
+    except (TypeError, ValueError) as error:
+        raise BadModelError(f"gains is {shown(gains)}; K1, K2 and K3 are wanted") from error
     own, front, spacing = (
-        checked_gain(name, gain, formation.axes) for name, gain in zip(("K1", "K2", "K3"), gains, strict=True)
+        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
     )
     return _assess(formation, (own, front, spacing), feed_forward, period_s=period_s, requirement=None)
 

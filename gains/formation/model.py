@@ -5,13 +5,14 @@ M.Tech thesis, NIT Rourkela, 2012, eqs. (2.10)-(2.12), written there for a chain
 """
 
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import real_matrix, strongly_connected_blocks
+from gains.core.structure import real_matrix, shown, strongly_connected_blocks
 
 LEADER = -1
 
@@ -48,8 +49,8 @@ class FormationModel:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "predecessors", _checked_predecessors(self.predecessors))
-        if self.axes < 1:
-            raise BadModelError(f"axes = {self.axes}; wanted 1 or more (2 for north and east)")
+        if not (isinstance(self.axes, Integral) and self.axes >= 1):
+            raise BadModelError(f"axes = {shown(self.axes)}; wanted 1 or more (2 for north and east)")
 
     @property
     def vehicles(self) -> int:
@@ -178,7 +179,10 @@ def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
 
 
 def _checked_predecessors(predecessors: ArrayLike) -> tuple[int, ...]:
-    array = np.array(predecessors)
+    try:
+        array = np.array(predecessors)
+    except ValueError as error:
+        raise BadModelError(f"predecessors = {shown(predecessors)}; wanted one number for each vehicle") from error
     if array.ndim != 1 or array.size == 0:
         raise BadModelError(f"predecessors has shape {array.shape}; wanted one number for each vehicle")
     if not np.issubdtype(array.dtype, np.integer):

@@ -20,6 +20,7 @@ from gains.core.structure import (
     block_diagonal,
     distinct_blocks,
     is_singular_for_any_delay,
+    of_type,
     without_equilibria,
 )
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
@@ -44,6 +45,8 @@ _LARGEST_MAP = 300
 _ROUNDING = 1e-11
 # backward error of such a map, in units of n eps and its norm
 _BACKWARD = 10.0
+# relative distance of neighbouring delays or periods, and the noise of a radius in units of the spread at three of them
+_NEIGHBOUR, _NOISE = 1e-15, 4.0
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
     >>> round(found.delay_margin_s, 6), found.checked_by
     (1.570796, ('sweep', 'rightmost root'))
     """
+    of_type("model", model, DelayModel, HeldModel)
     if isinstance(model, HeldModel):
         return _with_unknown_period(model) if model.period_s is None else _with_known_period(model, model.period_s)
     return _with_unknown_delay(model) if model.unknown else _at_given_delays(model)
@@ -309,22 +313,39 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
 
 
 def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
-    """Rounding error (s) of the delay or period at which the spectral radius of a one-period map passes one."""
-    matrix = map_at(at_s)
-    size = len(matrix)
-    if size > _LARGEST_MAP:
+    """Rounding error (s) of the delay or period at which the spectral radius of a one-period map passes one.
+
+    At this distance, on both sides, the radius differs from one by more than rounding. The slope over a wider interval
+    gives the least of the distances tried; beside a double eigenvalue it is far from the slope at the crossing.
+    """
+    if len(map_at(at_s)) > _LARGEST_MAP:
         return np.nan
     step_s = _BESIDE * at_s
-    before, after = (float(np.abs(np.linalg.eigvals(map_at(at_s + way * step_s))).max()) for way in (-1.0, 1.0))
+    before, after = (radius_of(map_at(at_s + way * step_s)) for way in (-1.0, 1.0))
     slope = abs(after - before) / (2.0 * step_s)
+    # neighbouring numbers give maps that differ by the rounding of an exponential, far above that of an eigenvalue if
+    # the states have very different units
+    radii = [radius_of(map_at(at_s * (1.0 + k * _NEIGHBOUR))) for k in (-1, 0, 1)]
+    noise = _NOISE * (max(radii) - min(radii))
+    error_s = max(_radius_error(map_at(at_s)), noise) / slope if slope > 0.0 else at_s
+    while error_s < at_s:
+        beside = [map_at(at_s + way * error_s) for way in (-1.0, 1.0)]
+        if all(abs(radius_of(step) - 1.0) > max(_radius_error(step), noise) for step in beside):
+            break
+        error_s *= 2.0
+    return min(error_s, at_s)
+
+
+def _radius_error(matrix: FloatArray) -> float:
+    """Rounding error of the spectral radius of a one-period map."""
+    size = len(matrix)
     eigenvalues, vectors = np.linalg.eig(matrix)
     epsilon = _BACKWARD * size * float(np.finfo(np.float64).eps) * float(np.linalg.norm(matrix))
     # the angle between left and right eigenvectors of the largest eigenvalue determines its condition
     k = int(np.argmax(np.abs(eigenvalues)))
     left = np.linalg.svd(matrix - eigenvalues[k] * np.eye(size))[0][:, -1]
     angle = abs(complex(left.conj() @ vectors[:, k]))
-    moved = min(epsilon / max(angle, 1e-300), epsilon ** (1.0 / max(size, 2)))
-    return min(moved / slope if slope > 0.0 else inf, at_s)
+    return min(epsilon / max(angle, 1e-300), epsilon ** (1.0 / max(size, 2)))
 
 
 def _common_divisor(multiples: list[Fraction]) -> Fraction:

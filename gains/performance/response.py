@@ -15,12 +15,13 @@ and `gains.sampled.multirate` compute the margin.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import factorial
+from math import factorial, inf
 
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
+from gains.core.structure import is_number, shown
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing, multirate_delay_margin
@@ -49,8 +50,8 @@ class Response:
         least = {"lag_s": 1e-6, "velocity_gain_1_s": 0.0, "dead_time_s": 0.0}
         for name, bound in (least if natural is None else least | {"natural_frequency_rad_s": 1e-6}).items():
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= bound):
-                raise BadModelError(f"{name} = {value}; wanted a number of at least {bound:g}")
+            if not (is_number(value) and bound <= value < inf):
+                raise BadModelError(f"{name} = {shown(value)}; wanted a number of at least {bound:g}")
         if natural is not None and self.dead_time_s:
             raise BadModelError(f"dead_time_s = {self.dead_time_s}; wanted 0 with a natural frequency")
 

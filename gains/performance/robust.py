@@ -45,7 +45,7 @@ def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
     It is the loop of a leader and one follower. Arguments and exceptions as for `robustness`.
     """
     given = {"K1": K1, "K2": K2, "K3": K3}
-    gains = [real_matrix(name, np.atleast_2d(np.asarray(gain))) for name, gain in given.items()]
+    gains = [real_matrix(name, gain if isinstance(gain, list) else np.atleast_2d(gain)) for name, gain in given.items()]
     A0, A1 = FormationModel((-1, 0), axes=len(gains[0])).ground_loop(*gains)
     return A0 + A1
 

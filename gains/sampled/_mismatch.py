@@ -23,7 +23,7 @@ from gains.core.errors import DisagreementError
 from gains.delay._loci import log_moduli, solved_beside_poles
 from gains.sampled._continuous_mismatch import continuous_crossings, highest_crossing
 from gains.sampled._loop import HeldPlant, radius_of
-from gains.sampled._predicted_difference import PredictedDifference
+from gains.sampled._predicted_difference import ROUNDING, PredictedDifference
 from gains.sampled.multirate import Timing
 
 # fractions of a period at which loci are computed, twice as many at two rates; angle (rad) per period below which one
@@ -35,6 +35,9 @@ _TRIED, _AT_ASSUMED = 16, 1e-9
 # Newton's method: most steps; last step of a converged solution (control periods); increments for derivatives, as
 # shares of angle and period
 _STEPS, _SOLVED, _DIFFERENCE = 8, 1e-9, 1e-7
+# further steps, each of which leaves a fixed part of the distance to a multiple solution; least singular value there,
+# and where it is worth them
+_STEPS_TO_MULTIPLE, _NEARLY = 40, 1e-4
 # states of the largest map whose spectrum is computed; most kinks tested, times the control periods in a common one
 _LARGEST_CHECK, _KINKS = 40, 600
 # shares of the mismatch at the end at which the loop must be stable; relative offset of the tests beside the end;
@@ -149,7 +152,9 @@ class _Search:
     def _between(self, way: float, stable_s: float, unstable_s: float, ends_s: FloatArray) -> float:
         """The end between a stable and an unstable mismatch (s); `ends_s` are solutions, some of them perhaps there."""
         for halving in range(_HALVINGS):
-            ends_s = ends_s[(ends_s >= stable_s) & (ends_s <= unstable_s)]
+            # a mismatch is known to the rounding of the delay
+            blur_s = _SAME * (stable_s + self.tick_s)
+            ends_s = ends_s[(ends_s >= stable_s - blur_s) & (ends_s <= unstable_s + blur_s)]
             if ends_s.size:
                 end_s = float(ends_s.min())
                 inside_s = (1.0 - _BESIDE) * end_s
@@ -177,11 +182,17 @@ class _Search:
             angle = angle[nearest[angle[nearest] >= 0.0]][:_BESIDE_IT]
         else:
             [(angle, values)] = self.loop.resolved(np.array([delay_s]))
-            sizes = np.abs(values)
+            sizes = np.abs(np.nan_to_num(values))
             dips = np.flatnonzero((sizes[1:-1] <= sizes[:-2]) & (sizes[1:-1] <= sizes[2:])) + 1
             least = np.concatenate([[0], dips, [sizes.size - 1]])
             angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
-        return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
+        delays_s = np.full(angle.size, delay_s)
+        here_s = delays_s[self._least_singular(angle, delays_s) <= ROUNDING]
+        return np.append(here_s - self.assumed_s, self._refined(angle, delays_s - self.assumed_s))
+
+    def _least_singular(self, angle: FloatArray, delays_s: FloatArray) -> FloatArray:
+        """The least singular value of I - N beside its terms (k,), at rounding where an eigenvalue is on the circle."""
+        return self.loop.least_singular(self.loop.at(angle), self.loop.answers(delays_s))
 
     def _is_stable(self, delay_s: float) -> bool:
         if delay_s not in self.stable:
@@ -251,7 +262,14 @@ class _Search:
         vectors = np.linalg.svd(self.loop.differences(self.loop.at(angle), self.loop.answers(delay_s)))
         left, right = vectors.Vh[:, -1], vectors.U[:, :, -1:]
         solved_s = [np.zeros(0)]
-        for _ in range(_STEPS):
+        for step in range(_STEPS + _STEPS_TO_MULTIPLE):
+            if step >= _STEPS:  # few are left: what is nearly a solution may be a multiple one
+                least = self._least_singular(angle, delay_s)
+                solved_s.append(delay_s[least <= ROUNDING])
+                left_over = (least > ROUNDING) & (least <= _NEARLY)
+                angle, delay_s, left, right = (part[left_over] for part in (angle, delay_s, left, right))
+                if not angle.size:
+                    break
             answers = self.loop.answers(np.concatenate([delay_s, delay_s + beside_s]))
             # at the point itself, with the angle incremented, and with the delay incremented
             here, turn = np.arange(angle.size), _DIFFERENCE * np.where(angle > 0.0, angle, 1.0)

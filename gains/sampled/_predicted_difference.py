@@ -14,7 +14,7 @@ is stable exactly if det(I - N) does not encircle 0 as z goes around the unit ci
 """
 
 from functools import cached_property
-from math import ceil, pi
+from math import ceil, isnan, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,8 @@ _SMALL = 0.95
 # largest relative change of det(I - N) between neighbouring angles; parts into which an interval is divided to meet it;
 # most such refinements; the modulus that replaces zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
+# least singular value of I - N, beside its terms, up to which it is rounding; refinements before it is looked at
+ROUNDING, _USUAL = 1e-14, 3
 
 
 class Grid(NamedTuple):
@@ -146,6 +148,11 @@ class PredictedDifference:
         values = np.linalg.det(self.differences(grid, answers)).astype(np.complex128)
         return np.where(values == 0.0, _LEAST, values)
 
+    def least_singular(self, grid: Grid, answers: Answers) -> FloatArray:
+        """The least singular value of I - N beside its terms (k,)."""
+        least = np.linalg.svd(self.differences(grid, answers), compute_uv=False)[:, -1]
+        return least / (1.0 + np.linalg.norm(grid.assumed, axis=(1, 2)))
+
     def states(self, delay_s: float) -> int:
         """The number of states of `maps` at a true delay."""
         late_s = max(delay_s, self.assumed_s) - self.spread_s
@@ -179,26 +186,36 @@ class PredictedDifference:
         return maps
 
     def turns(self, delays_s: list[float]) -> list[int]:
-        """How often det(I - N) encircles 0, clockwise, as z goes around the unit circle, at each true delay."""
-        turned = [np.angle(values[1:] / values[:-1]).sum() for _, values in self.resolved(np.array(delays_s))]
+        """How often det(I - N) encircles 0, clockwise, as z goes around the unit circle, at each true delay.
+
+        1 if det(I - N) is 0 to rounding at some angle: the loop is not asymptotically stable, as far as can be known.
+        """
+        # nan / nan is computed apart from the usual warning
+        turned = [np.angle(values[1:] * values[:-1].conj()).sum() for _, values in self.resolved(np.array(delays_s))]
         last = self.grid.angle[-1:].repeat(len(delays_s))
         if last[0] < pi:  # from there to pi the eigenvalues of I - N stay in the right half plane
             beyond = np.linalg.eigvals(self.differences(self.at(last), self.answers(np.array(delays_s))))
             turned -= np.angle(beyond).sum(axis=1)
-        return [-round(float(turn) / pi) for turn in turned]
+        return [1 if isnan(turn) else -round(float(turn) / pi) for turn in turned]
 
     def resolved(self, delays_s: FloatArray) -> list[tuple[FloatArray, ComplexArray]]:
-        """For each true delay, angles and det(I - N), refined until it changes little from each angle to the next."""
+        """For each true delay, angles and det(I - N), refined until it changes little from each angle to the next.
+
+        nan where it is 0 to rounding, as beside a multiple eigenvalue on the unit circle: its changes there are noise.
+        """
         answers = self.answers(delays_s)
         found = [(self.grid.angle, self.determinants(self.grid, own)) for own in answers.each()]
         changing = list(range(delays_s.size))
-        for _ in range(_REFINEMENTS):
+        for refinement in range(_REFINEMENTS):
             between = {k: added for k in changing if (added := _refining(*found[k])).size}
             changing = list(between)
             if not changing:
                 break
             of = np.repeat(changing, [own.size for own in between.values()])
-            added = self.determinants(self.at(np.concatenate([*between.values()])), answers.of(of))
+            grid, own = self.at(np.concatenate([*between.values()])), answers.of(of)
+            added = self.determinants(grid, own)
+            if refinement >= _USUAL:
+                added[self.least_singular(grid, own) <= ROUNDING] = np.nan
             for k in changing:
                 angle = np.concatenate([found[k][0], between[k]])
                 order = np.argsort(angle)

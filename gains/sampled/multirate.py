@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray, IntArray
-from gains.core.structure import positive_seconds, seconds
+from gains.core.structure import of_type, positive_seconds, seconds
 from gains.delay.constant import delay_margin
 from gains.sampled._loop import HeldPlant, SampledPlant, block_radius, held_blocks, radius_of, rate_of
 from gains.sampled.constant import checked_loop, sampled_delay_margin
@@ -137,7 +137,8 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; BadModelError names one that does not fit. A
     `delay_s` (s) below the least mean possible at these rates is raised to it.
     """
-    return lifted_growth(held_blocks(*checked_loop(A, B, K), period_s=timing.common_s), timing, delay_s=delay_s)
+    common_s = of_type("timing", timing, Timing).common_s
+    return lifted_growth(held_blocks(*checked_loop(A, B, K), period_s=common_s), timing, delay_s=delay_s)
 
 
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
@@ -154,7 +155,7 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
     [1.0, 1.0]
     """
-    if timing.commands == 1:
+    if of_type("timing", timing, Timing).commands == 1:
         return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     plant, entry, feedback = checked_loop(A, B, K)
     continuous_s = delay_margin(plant, entry @ feedback)

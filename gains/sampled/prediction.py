@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import seconds
+from gains.core.structure import of_type, seconds, shown
 from gains.sampled._continuous_mismatch import continuous_crossings
 from gains.sampled._loop import held_blocks, rate_of
 from gains.sampled._mismatch import common_window
@@ -49,9 +49,10 @@ def mismatch_window(
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     The first is 0 if the loop is stable down to zero delay, the second `inf` if no upper limit is found; both are
-    `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s,
-    each confirmed on either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map
-    is large. Between them the window is a search, not a proof: see `gains.sampled._mismatch`.
+    `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, or
+    to the q-th root of 1e-14 at a q-fold eigenvalue, as of q equal followers in mixed coordinates. Each is confirmed on
+    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large. Between
+    them the window is a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay of the prediction.
@@ -65,7 +66,8 @@ def mismatch_window(
     [1.449, 4.765]
     """
     loop, late_s = checked_loop(A, B, K), seconds("assumed_s", assumed_s)
-    plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
+    common_s = of_type("timing", timing, Timing).common_s
+    plants = held_blocks(*loop, period_s=common_s, measured=checked_mask(loop, measured))
     return common_window(plants, timing, late_s)
 
 
@@ -111,15 +113,19 @@ def predicted_growth_rate(
     -1.386294
     """
     loop, late_s = checked_loop(A, B, K), seconds("assumed_s", assumed_s)
-    plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
+    common_s = of_type("timing", timing, Timing).common_s
+    plants = held_blocks(*loop, period_s=common_s, measured=checked_mask(loop, measured))
     radii = [lifted_radius(own, timing, delay_s=delay_s, predictor=Predictor(own, late_s)) for own in plants]
-    return rate_of(max(radii), timing.common_s)
+    return rate_of(max(radii), common_s)
 
 
 def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None) -> BoolArray | None:
     """Mask (n,) of the measured states, None if all are; BadModelError if it does not fit the loop."""
     A, _, K = loop
-    mask = None if measured is None else np.array(measured, dtype=np.bool_)
+    try:
+        mask = None if measured is None else np.array(measured, dtype=np.bool_)
+    except ValueError as error:
+        raise BadModelError(f"measured is {shown(measured)}; {len(A)} flags are wanted") from error
     if mask is None or mask.all():
         return None
     if mask.shape != (len(A),) or K[:, ~mask].any() or A[np.ix_(~mask, mask)].any():

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.core.structure import balanced, distinct_blocks, is_number, shown, square_matrices
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
 
@@ -46,8 +46,8 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
     6.06
     """
-    if not rate >= 0.0:
-        raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
+    if not (is_number(rate) and rate >= 0.0):
+        raise BadModelError(f"rate is {shown(rate)}; a number >= 0 is wanted, inf for any variation")
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     largest = max(len(block.matrices[0]) for block in blocks)
     if largest > _LARGEST_BLOCK:

@@ -50,7 +50,7 @@ class AutopilotFleet(Fleet):
         self._located: set[int] = set()
         """The rows whose frame has been known."""
         self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
-        self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
+        self._targets = VelocityTargets(self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
 
     @property

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from math import hypot
 
 from gcs.autopilot.startup import AutopilotStartup
-from gcs.link.vehicle import RemoteVehicle
 
 _CLIMB_GAIN_1_S = 0.5
 _CLIMB_MAX_M_S = 1.0
@@ -26,12 +25,9 @@ class _Target:
 
 
 class VelocityTargets:
-    def __init__(
-        self, vehicles: Sequence[RemoteVehicle], starts: Sequence[AutopilotStartup], *, period_s: float
-    ) -> None:
-        self._vehicles = vehicles
+    def __init__(self, starts: Sequence[AutopilotStartup], *, period_s: float) -> None:
         self._starts = starts
-        self._targets: list[_Target | None] = [None] * len(vehicles)
+        self._targets: list[_Target | None] = [None] * len(starts)
         self._period_s = period_s
 
     def hover(self, row: int) -> VelocitySetPoint:
@@ -68,7 +64,7 @@ class VelocityTargets:
                 north, east = own_north + share * (north - own_north), own_east + share * (east - own_east)
         self._targets[row] = _Target((north, east), acceleration_m_s2, now_ns)
         # A vehicle that holds the velocity between set-points is sent the velocity at the middle of the period.
-        ahead_s = 0.0 if self._vehicles[row].kind.velocity_grows else self._period_s / 2.0
+        ahead_s = 0.0 if self._starts[row].kind.velocity_grows else self._period_s / 2.0
         sent = north + ahead_s * acceleration_m_s2[0], east + ahead_s * acceleration_m_s2[1]
         return self._with_climb(row, sent, acceleration_m_s2)
 

@@ -20,6 +20,7 @@ from gcs.control.history import Instants, Reports, States
 from gcs.plan.formation import Formation
 from scenarios.kernel import Array, Records, array_kernel
 
+Vector = tuple[float, float]
 LOST = -2
 """Stands for the vehicle ahead in the row of a lost vehicle."""
 
@@ -137,53 +138,47 @@ def unblended(vehicles: int) -> Records:
     return blends
 
 
-def formation_control(
-    history: Reports,
-    law: FeedbackLaw,
-    blends: Records,
-    *,
-    nominal_velocity_m_s: tuple[float, float],
-    opening: float = 1.0,
-) -> Records:
+class Moment(NamedTuple):
+    """Inputs of a control tick that are common to all vehicles."""
+
+    due_ns: int
+    time_s: float
+    """Scenario time."""
+    nominal_velocity_m_s: Vector
+    opening: float = 1.0
+    """Factor on the formation's spacing."""
+
+
+def formation_control(history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
     """Errors and commands of every vehicle (n, CONTROL) from the newest reported states.
 
-    `blends` holds the gains of each vehicle, `opening` is a factor on the formation's spacing. A command that depends
-    on an unknown state is NaN and must not be sent. No limit is applied here.
+    `blends` holds the gains of each vehicle. A command that depends on an unknown state is NaN and must not be sent. No
+    limit is applied here.
     """
     times_ns, states = history.every_newest()
-    controls = np.empty(len(times_ns), CONTROL)
     seen = history.every_at(law.source, times_ns.take(law.to))
-    control_all(controls, law, times_ns, states, seen, blends, *nominal_velocity_m_s, opening)
-    return controls
+    return _controls(law, times_ns, states, seen, blends, now)
 
 
-def commands_at(
-    states: States,
-    law: FeedbackLaw,
-    times_ns: Instants,
-    blends: Records,
-    nominal_velocity_m_s: tuple[float, float],
-    opening: float,
-) -> FloatArray:
+def commands_at(states: States, law: FeedbackLaw, times_ns: Instants, blends: Records, now: Moment) -> FloatArray:
     """The command (n, 2) of each vehicle, from the errors at its own instant."""
     own = states.every_at(np.arange(len(times_ns)), times_ns)
     seen, others = own[law.to], (law.source != law.to).nonzero()[0]
     seen[others] = states.every_at(law.source[others], times_ns[law.to[others]])
-    return commands_of(law, own, seen, blends, nominal_velocity_m_s, opening)
+    return commands_of(law, own, seen, blends, now)
 
 
-def commands_of(
-    law: FeedbackLaw,
-    own: FloatArray,
-    seen: FloatArray,
-    blends: Records,
-    nominal_velocity_m_s: tuple[float, float],
-    opening: float,
-) -> FloatArray:
+def commands_of(law: FeedbackLaw, own: FloatArray, seen: FloatArray, blends: Records, now: Moment) -> FloatArray:
     """The command (n, 2) of each vehicle, from its own state (n, 4) and the states that the law's terms use (m, 4)."""
+    return _controls(law, np.ones(len(own), np.int64), own, seen, blends, now)["command_m_s2"]
+
+
+def _controls(
+    law: FeedbackLaw, times_ns: Instants, own: FloatArray, seen: FloatArray, blends: Records, now: Moment
+) -> Records:
     controls = np.empty(len(own), CONTROL)
-    control_all(controls, law, np.ones(len(own), np.int64), own, seen, blends, *nominal_velocity_m_s, opening)
-    return controls["command_m_s2"]
+    control_all(controls, law, times_ns, own, seen, blends, *now.nominal_velocity_m_s, now.opening)
+    return controls
 
 
 @array_kernel

@@ -16,7 +16,15 @@ from gains.core.arrays import FloatArray
 from gains.sampled.onboard import own_part
 from gcs.control.acted import ActiveTargets
 from gcs.control.history import Instants, Reports
-from gcs.control.law import FeedbackLaw, commands_at, commands_of, feedback_law, formation_control
+from gcs.control.law import (
+    FeedbackLaw,
+    Moment,
+    Vector,
+    commands_at,
+    commands_of,
+    feedback_law,
+    formation_control,
+)
 from gcs.control.predicted_stream import StreamPrediction
 from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.control.responding import Responding
@@ -30,19 +38,7 @@ from gcs.plan.onboard import own_parameters
 from scenarios.kernel import Array, Records, kernel
 from scenarios.schema import NS_PER_S
 
-Vector = tuple[float, float]
 _NEVER_NS = np.iinfo(np.int64).max
-
-
-class Moment(NamedTuple):
-    """Inputs of a control tick that are common to all vehicles."""
-
-    due_ns: int
-    time_s: float
-    """Scenario time."""
-    nominal_velocity_m_s: Vector
-    opening: float = 1.0
-    """Factor on the formation's spacing."""
 
 
 class Orders(NamedTuple):
@@ -75,9 +71,7 @@ class Loop:
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         """Errors of every vehicle at a tick and the acceleration to send: see `law.formation_control`."""
-        return formation_control(
-            history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
-        )
+        return formation_control(history, law, blends, now)
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Process a measured one-way delay to a vehicle, of a message sent at `sent_ns`."""
@@ -139,7 +133,7 @@ class PredictingGroundLoop(Loop):
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         controls = super().control(history, law, blends, now)
         acts_ns, assumed_s = self._states.look(history, now.due_ns)
-        commands = commands_at(self._states, law, acts_ns, blends, now.nominal_velocity_m_s, now.opening)
+        commands = commands_at(self._states, law, acts_ns, blends, now)
         _replace(controls, (acts_ns > 0) & law.flown, command_m_s2=commands, assumed_s=assumed_s, acts_ns=acts_ns)
         return controls
 
@@ -181,7 +175,7 @@ class StreamedLoop(Loop):
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         controls = super().control(history, law, blends, now)
         used_ns = _oldest_needed_ns(law, controls["sample_ns"])
-        commands = commands_at(history, law, used_ns, blends, now.nominal_velocity_m_s, now.opening)
+        commands = commands_at(history, law, used_ns, blends, now)
         others = (used_ns > 0) & (used_ns != controls["sample_ns"])
         _replace(controls, others & law.flown, command_m_s2=commands, used_ns=used_ns)
         self._open(controls["command_m_s2"], now.opening)
@@ -214,8 +208,7 @@ class PredictingStreamedLoop(StreamedLoop):
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
         controls = super().control(history, law, blends, now)
-        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
-        self._prediction.look(history, law, now.due_ns, nominal_m_s)
+        self._prediction.look(history, law, now.due_ns, now.nominal_velocity_m_s)
         own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.source), 4))
         acts_ns, assumed_s = np.zeros(len(controls), np.int64), np.zeros(len(controls))
         for row in range(len(controls)):
@@ -224,8 +217,8 @@ class PredictingStreamedLoop(StreamedLoop):
                 acts_ns[row], assumed_s[row], states = found
                 terms = slice(law.begin[row], law.begin[row + 1])
                 own[row], seen[terms] = states[row], [states[source] for source in law.source[terms].tolist()]
-        commands = commands_of(law, own, seen, blends, nominal_m_s, opening)
-        self._open(commands, opening)
+        commands = commands_of(law, own, seen, blends, now)
+        self._open(commands, now.opening)
         used_ns = np.array([self._prediction.used_ns(row) for row in range(len(controls))])
         _replace(
             controls, acts_ns > 0, command_m_s2=commands, used_ns=used_ns, assumed_s=assumed_s, acts_ns=acts_ns

@@ -8,6 +8,7 @@ calls of this kind, the flight ends and the vehicles hold.
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from math import isfinite, nan
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import Reports
-from gcs.control.law import FeedbackLaw, feedback_law
+from gcs.control.law import FeedbackLaw, Vector, feedback_law
 from gcs.control.loops import Loop, Moment
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import LawFormation, accelerations, law_formation
@@ -28,7 +29,6 @@ BAD_IN_A_ROW = 25
 LAW = "law"
 """Kind of the events about a law: its first bad call, and its counts at the end."""
 CALLS, BAD, OVER = "calls", "bad", "over budget"
-Vector = tuple[float, float]
 _HOLD = 0.0, 0.0
 
 
@@ -99,28 +99,23 @@ class OwnLawLoop(Loop):
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
         super().__init__(plan)
         self._law = law
-        self._known: tuple[Vector, float] | None = None
-        self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
+        self._formation_at = lru_cache(maxsize=1)(partial(law_formation, plan.formation, period_s=plan.timing.step_s))
 
     def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         """The law with zero gains, which still gives the spacing errors and marks the lost vehicles."""
         return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
-        time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
         controls = super().control(history, law, blends, now)
         flown = law.flown
         instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0
-        if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
+        if now.time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
             controls["command_m_s2"] = nan
             return controls
         states = np.full((len(flown), 4), nan)
         states[flown] = history.every_at(np.flatnonzero(flown), np.full(flown.sum(), instant_ns))
-        if self._known != (velocity_m_s, opening):
-            self._known = velocity_m_s, opening
-            period_s = self._plan.timing.step_s
-            self._formation = law_formation(self._plan.formation, velocity_m_s, period_s, opening)
-        commands = np.array(self._law.commands(time_s, states, self._formation))
+        formation = self._formation_at(now.nominal_velocity_m_s, opening=now.opening)
+        commands = np.array(self._law.commands(now.time_s, states, formation))
         controls["command_m_s2"][flown], controls["used_ns"][flown] = commands[flown], instant_ns
         return controls
 

@@ -206,10 +206,3 @@ class Links(Part):
     """Zero of the link time, to which outages and delay points refer. `flight`: when the station's first set-point
     enters a link; before that, the first delay point applies and there is no outage. `start`: when the vehicles
     start."""
-
-    def of(self, system_id: int) -> tuple[Link, Link]:
-        """The (up, down) links of one vehicle."""
-        for own in self.vehicles:
-            if own.system_id == system_id:
-                return own.up or self.up, own.down or self.down
-        return self.up, self.down

@@ -17,6 +17,7 @@ Decisions that the guide leaves open:
 import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
+from heapq import heappop, heappush
 from hmac import compare_digest
 
 from fastcrc.crc16 import mcrf4xx
@@ -67,7 +68,7 @@ class SignedLink:
         self._own = 1 << 33 | of_owner | link_id
         self._timestamp = stamps.known.get(self._own, 0)
         stamps.keep(self._own, self._timestamp)
-        self._recent: dict[int, _Recent] = {}
+        self._recent: dict[int, list[int]] = {}
 
     def sign(self, frame: bytes, now_ns: int) -> bytes:
         """Sign one of our frames, with a timestamp newer than any that this end has sent or heard."""
@@ -100,11 +101,8 @@ class SignedLink:
                 refused[TRUNCATED] += 1
                 break
             frame = datagram[at:stop]
-            reason = self._fault(frame)
-            if not reason and unwanted is not None:
-                reason = unwanted(frame[5])
-            if not reason:
-                reason = self._staleness(frame, now_ns)
+            reason = self._fault(frame) or (unwanted(frame[5]) if unwanted is not None else "")
+            reason = reason or self._staleness(frame, now_ns)
             if reason:
                 refused[reason] += 1
             else:
@@ -130,16 +128,18 @@ class SignedLink:
         stream = self._streams | frame[5] << 16 | frame[6] << 8 | frame[-13]
         timestamp = int.from_bytes(frame[-12:-6], "little")
         newest = self._stamps.known.get(stream, -1)
-        recent = self._recent.get(stream)
+        recent = self._recent.get(stream, [newest])
         if timestamp <= newest:
-            return OVERTAKEN if recent is not None and recent.was_overtaken(timestamp) else REPLAYED
+            if timestamp <= recent[0] or timestamp in recent:
+                return REPLAYED
+            _remember(recent, timestamp)
+            return OVERTAKEN
         if newest < 0 and timestamp + MINUTE < max(self._timestamp, (now_ns + self._offset_ns) // TICK_NS):
             return TOO_OLD
         if not self._stamps.keep(stream, timestamp):
             return TOO_MANY
-        if recent is None:
-            recent = self._recent[stream] = _Recent(newest)
-        recent.add(timestamp)
+        self._recent[stream] = recent
+        _remember(recent, timestamp)
         self._timestamp = max(self._timestamp, timestamp)
         return ""
 
@@ -153,26 +153,8 @@ def _toggled(frame: bytes) -> bytes:
     return frame[:2] + bytes([frame[2] ^ SIGNED]) + frame[3:-CHECKSUM] + checksum.to_bytes(2, "little")
 
 
-class _Recent:
-    """The last accepted timestamps of a stream: at least REMEMBERED of them, if there have been as many."""
-
-    __slots__ = ("_after", "_newer", "_older")
-
-    def __init__(self, newest: int) -> None:
-        self._after = newest
-        """All seen timestamps newer than this are remembered."""
-        self._newer: set[int] = set()
-        self._older: set[int] = set()
-
-    def add(self, timestamp: int) -> None:
-        if len(self._newer) == REMEMBERED:
-            self._older, self._newer = self._newer, set()
-            self._after = max(self._after, min(self._older) - 1)
-        self._newer.add(timestamp)
-
-    def was_overtaken(self, timestamp: int) -> bool:
-        """Whether an older timestamp has not been seen; marks it as seen."""
-        if timestamp <= self._after or timestamp in self._newer or timestamp in self._older:
-            return False
-        self._older.add(timestamp)
-        return True
+def _remember(recent: list[int], timestamp: int) -> None:
+    """Add a timestamp to the heap of a stream's newest: all that were seen and are newer than its first are in it."""
+    heappush(recent, timestamp)
+    if len(recent) > REMEMBERED:
+        heappop(recent)

@@ -6,8 +6,7 @@ does not shift the draws of another.
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,17 +84,15 @@ def flip(data: NDArray[np.uint8], size: int, flips: NDArray[np.float64], count: 
             data[place // 8] ^= 1 << place % 8
 
 
-_Delays = Callable[[int], Sequence[tuple[float, float]] | NDArray[np.float64]]
-"""Draws the jitter of a number of datagrams and of their duplicates, in s."""
-
-
 class Stream:
     """The draws of one link, a block at a time."""
 
     def __init__(self, link: link_keys.Link, seeds: np.random.SeedSequence) -> None:
-        fates, delays = seeds.spawn(2)
-        self._fates = np.random.default_rng(fates)
-        self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
+        self._fates, self._delays = map(np.random.default_rng, seeds.spawn(2))
+        self._jitter = link.jitter
+        if link.jitter is not None and link.jitter.distribution == "trace":
+            self._trace_s = np.array(link.jitter.trace_s or (0.0,))
+            self._at = int(self._delays.integers(len(self._trace_s)))
 
     def fill(self, block: Records) -> None:
         """Fill a block of `DRAW` with the next draws."""
@@ -103,26 +100,17 @@ class Stream:
         for k, name in enumerate(("burst", "loss", "duplicate", "corrupt")):
             block[name] = uniform[:, k]
         block["flips"] = uniform[:, 4:]
-        delays_ns = np.rint(np.array(self._delays(BLOCK)) * NS_PER_S)
-        block["jitter_ns"], block["duplicate_jitter_ns"] = delays_ns.T
+        if self._jitter is not None:
+            delays_ns = np.rint(self._delays_s(self._jitter) * NS_PER_S)
+            block["jitter_ns"], block["duplicate_jitter_ns"] = delays_ns.T
 
+    def _delays_s(self, jitter: link_keys.Jitter) -> NDArray[np.float64]:
+        """The jitter of each datagram of a block and of its duplicate, (BLOCK, 2).
 
-def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _Delays:
-    if jitter is None:
-        return lambda count: [(0.0, 0.0)] * count
-    if jitter.distribution == "trace":
-        return _in_trace_order(jitter.trace_s or (0.0,), rng)
-    return lambda count: jitter.drawn_s((count, 2), rng)
-
-
-def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
-    """Delays of a trace in their own order, which preserves their correlation; a duplicate takes the next delay."""
-    at = int(rng.integers(len(trace_s)))
-
-    def drawn(count: int) -> list[tuple[float, float]]:
-        nonlocal at
-        places = [(at + k) % len(trace_s) for k in range(count + 1)]
-        at = places[-1]
-        return [(trace_s[k], trace_s[then]) for k, then in pairwise(places)]
-
-    return drawn
+        Delays of a trace keep their order, which preserves their correlation; a duplicate takes the next delay.
+        """
+        if jitter.distribution != "trace":
+            return jitter.drawn_s((BLOCK, 2), self._delays)
+        delays_s = self._trace_s[(self._at + np.arange(BLOCK + 1)) % len(self._trace_s)]
+        self._at += BLOCK
+        return np.column_stack([delays_s[:-1], delays_s[1:]])

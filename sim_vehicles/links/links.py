@@ -231,8 +231,7 @@ class LinkSet:
     def __init__(
         self, scenario: schema.Scenario, start_ns: int, *, recorder: Recorder | None = None, most: int = MOST_IN_NETWORK
     ) -> None:
-        self._links = scenario.links
-        self._seed = scenario.seed
+        self._scenario = scenario
         self._channels: dict[tuple[str, int, int], Channel] = {}
         self._known = {channel.name: channel for channel in scenario.links.channels}
         self._pairs: dict[int, tuple[Link, Link]] = {}
@@ -250,7 +249,7 @@ class LinkSet:
     def of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of a vehicle, the same at every call."""
         if system_id not in self._pairs:
-            up, down = self._links.of(system_id)
+            up, down = self._scenario.link_of(system_id)
             pair = self._new(up, system_id, LINK_UP), self._new(down, system_id, LINK_DOWN)
             self._pairs[system_id] = pair
             self._in_rows += pair
@@ -290,10 +289,10 @@ class LinkSet:
         return total
 
     def _new(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
+        row, channel = row_of(len(self._pairs), kind), self._channel(link.channel, system_id, kind)
         made = Link(
-            link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
-            queues=self.queues, row=row_of(len(self._pairs), kind),
-        )  # fmt: skip
+            link, seed=self._scenario.seed, system_id=system_id, kind=kind, channel=channel, queues=self.queues, row=row
+        )
         made.zero_ns = self.zero_ns
         return made
 

@@ -15,9 +15,9 @@ from scenarios.networks import MOST_IN_NETWORK
 from sim_vehicles.links.links import LinkSet
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Recorder
 from sim_vehicles.services.clock import NEVER_NS
-from sim_vehicles.services.mavlink import COMPONENT_AUTOPILOT
+from sim_vehicles.services.frames import AUTOPILOT
+from sim_vehicles.services.mavlink import MAGIC_1, MAGIC_2
 
-MAGIC_1, MAGIC_2 = 0xFE, 0xFD
 SETUP_SIGNING = (256).to_bytes(3, "little")
 
 
@@ -42,7 +42,7 @@ def sender(data: bytes) -> int | None:
         system_id, component_id = data[3:5]
     else:
         return None
-    return system_id if 1 <= system_id <= MOST_IN_NETWORK and component_id == COMPONENT_AUTOPILOT else None
+    return system_id if 1 <= system_id <= MOST_IN_NETWORK and component_id == AUTOPILOT else None
 
 
 def holds_key(data: bytes) -> bool:

@@ -10,8 +10,8 @@ from the start of the vehicles, so common gusts push all of them at once.
 """
 
 import math
-from collections.abc import Callable, Iterator
-from typing import NamedTuple, TypeVar
+from collections.abc import Iterator
+from typing import NamedTuple
 
 from scenarios.keys import disturbance
 from scenarios.schema import NS_PER_S, Scenario
@@ -22,8 +22,6 @@ from sim_vehicles.services.draws import Use, draws_of
 STEP_NS = 10_000_000
 """How long gusts are held."""
 _BLOCK = 512
-
-Moved = TypeVar("Moved")
 
 
 class Push(NamedTuple):
@@ -82,28 +80,11 @@ class Air:
         """Set what the fleet adds, until the next call; the vehicle must be up to date."""
         self._added = push
 
-    def moved(
-        self,
-        motion: Moved,
-        move: Callable[[Moved, float], Moved],
-        shift: Callable[[Moved, float, float, float, float], Moved],
-        from_ns: int,
-        to_ns: int,
-        *,
-        foreseen: bool = False,
-    ) -> Moved:
-        """The motion at a later time; `move` is the vehicle's own motion over a duration in s.
-
-        `shift` adds changes of position (north, east) and velocity to a motion.
-        """
-        for t, half_north, half_east, north, east in self.pieces(from_ns, to_ns, foreseen=foreseen):
-            motion = shift(motion, 0.0, 0.0, half_north, half_east)
-            motion = shift(move(motion, t), north, east, half_north, half_east)
-        return motion
-
     def pieces(self, from_ns: int, to_ns: int, *, foreseen: bool = False) -> Iterator[Piece]:
         """The intervals of constant push, in order. They must be consumed at once.
 
+        In each, half the change of velocity comes before the vehicle's own motion; the other half and the distance that
+        it is carried come after it.
         `foreseen`: a look ahead over an interval that will be computed again, so nothing is recorded or forgotten.
         """
         while from_ns < to_ns:

@@ -112,14 +112,11 @@ class Aircraft:
         place = state.north_m + t * (north + half * a_north), state.east_m + t * (east + half * a_east)
         return state_from(place, (north + t * a_north, east + t * a_east))
 
-    def climbed(self) -> tuple[float, float]:
-        """Height gained since the start, and climb rate, at the last step."""
-        return self._model["position/h-sl-ft"] * FOOT_M - self._height_m, self._model["velocities/h-dot-fps"] * FOOT_M
-
     def attitude(self) -> Attitude:
-        """Height gained, climb rate and angles, at the last step."""
+        """Height gained since the start, climb rate and angles, at the last step."""
+        climbed_m = self._model["position/h-sl-ft"] * FOOT_M - self._height_m
         roll, pitch, heading = (self._model[f"attitude/{angle}-rad"] for angle in ("phi", "theta", "psi"))
-        return Attitude(*self.climbed(), roll, pitch, heading)
+        return Attitude(climbed_m, self._model["velocities/h-dot-fps"] * FOOT_M, roll, pitch, heading)
 
     def _step(self, wanted: complex) -> None:
         """Run autopilot and model for one step."""

@@ -76,7 +76,16 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
     return motion, target
 
 
-def shifted(motion: Motion, north_m: float, east_m: float, north_m_s: float, east_m_s: float) -> Motion:
+def pushed(
+    motion: Motion, target: Target, limits: schema.Autopilot, piece: tuple[float, float, float, float, float]
+) -> tuple[Motion, Target]:
+    """As `advance`, over an interval of constant push, a `Piece` of `air`."""
+    t, half_north, half_east, north, east = piece
+    motion, target = advance(_shifted(motion, 0.0, 0.0, half_north, half_east), target, limits, t)
+    return _shifted(motion, north, east, half_north, half_east), target
+
+
+def _shifted(motion: Motion, north_m: float, east_m: float, north_m_s: float, east_m_s: float) -> Motion:
     """The motion with these changes of position and velocity."""
     return motion._replace(
         north_m=motion.north_m + north_m,

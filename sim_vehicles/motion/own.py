@@ -35,47 +35,42 @@ class OwnMotion:
     def __init__(self, scenario: Scenario, on_fault: Callable[[str], None]) -> None:
         """`on_fault` is called with each fault, as one line."""
         self._step = function_of(scenario, "dynamics")
-        self._on_fault = on_fault
+        self._on_fault: Callable[[str], None] = on_fault
         self._memory: dict[str, Any] = {}
 
     def advance(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
         """The state after `duration_s` with the command held, as `double_integrator.advance`."""
         del bounds  # the model has its own limits
-        return self._moved(state, command, duration_s, self._memory, self._on_fault)
-
-    def foreseen(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
-        """As `advance`, but the memory stays as it is."""
-        del bounds
-        return self._moved(state, command, duration_s, copy.deepcopy(self._memory), lambda _: None)
-
-    def _moved(
-        self, state: State, command: Command, duration_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
-    ) -> State:
         flown: Floats = np.array([state.north_m, state.east_m, *state.velocity_ne_m_s()])
         steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
         dt_s = duration_s / steps
         for _ in range(steps):
-            after = self._after(flown, command, dt_s, memory, on_fault)
+            after = self._after(flown, command, dt_s)
             flown = np.concatenate([flown[:2] + dt_s * flown[2:], flown[2:]]) if after is None else after
         north, east, v_north, v_east = flown.tolist()
         return state_from((north, east), (v_north, v_east))
 
-    def _after(
-        self, flown: Floats, command: Command, dt_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
-    ) -> Floats | None:
+    def foreseen(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
+        """As `advance`, but the memory stays as it is, and faults are not reported."""
+        ahead = copy.copy(self)
+        ahead._memory = copy.deepcopy(self._memory)
+        ahead._on_fault = lambda _: None
+        return ahead.advance(state, command, bounds, duration_s)
+
+    def _after(self, flown: Floats, command: Command, dt_s: float) -> Floats | None:
         """The state a step later; None if the model raises an exception or returns an invalid state."""
         wanted = np.array(command[:2]) + command.velocity_gain_1_s * (np.array(command[2:4]) - flown[2:])
         try:
             with np.errstate(all="ignore"):
-                answer: object = self._step(flown.copy(), wanted, dt_s, memory)
+                answer: object = self._step(flown.copy(), wanted, dt_s, self._memory)
             found: Floats = np.array(answer, dtype=np.float64)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the user's model raises
-            on_fault(f"{type(error).__name__}: {error}")
+            self._on_fault(f"{type(error).__name__}: {error}")
             return None
         if found.shape != (4,):
-            on_fault(f"returned shape {found.shape}, wanted (4,)")
+            self._on_fault(f"returned shape {found.shape}, wanted (4,)")
         elif not (np.abs(found[:2]).max() <= FARTHEST_M and np.abs(found[2:]).max() <= FASTEST_M_S):
-            on_fault(f"returned {found.tolist()}")
+            self._on_fault(f"returned {found.tolist()}")
         else:
             return found
         return None

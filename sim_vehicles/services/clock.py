@@ -8,21 +8,20 @@ from scenarios.schema import NS_PER_S, Clocks
 from sim_vehicles.services.draws import Use, draws_of
 
 NS_PER_MS = 1_000_000
-PARTS = 1_000_000_000
 
 
 @kernel
 def boot_ns(start_ns: int, offset_ns: int, drift_ppb: int, host_ns: int) -> int:
     """Boot time that a clock shows. Whole seconds are multiplied separately: no product then exceeds 64 bits."""
-    whole, rest = divmod(host_ns - start_ns, PARTS)
-    return offset_ns + (host_ns - start_ns) + whole * drift_ppb + rest * drift_ppb // PARTS
+    whole, rest = divmod(host_ns - start_ns, NS_PER_S)
+    return offset_ns + (host_ns - start_ns) + whole * drift_ppb + rest * drift_ppb // NS_PER_S
 
 
 @kernel
 def host_ns(start_ns: int, offset_ns: int, drift_ppb: int, boot_ns: int) -> int:
     """The earliest host time (ns) at which a clock shows at least `boot_ns`."""
-    whole, rest = divmod(offset_ns - boot_ns, PARTS + drift_ppb)
-    return start_ns - whole * PARTS - rest * PARTS // (PARTS + drift_ppb)
+    whole, rest = divmod(offset_ns - boot_ns, NS_PER_S + drift_ppb)
+    return start_ns - whole * NS_PER_S - rest * NS_PER_S // (NS_PER_S + drift_ppb)
 
 
 @dataclass(frozen=True)

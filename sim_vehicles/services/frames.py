@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from scenarios.kernel import Record, int64, kernel
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
 
-HEARTBEAT, LOCAL_POSITION, GLOBAL_POSITION, SETPOINT, TIMESYNC = 0, 32, 33, 84, 111
-EXTRA = {HEARTBEAT: 50, LOCAL_POSITION: 185, GLOBAL_POSITION: 104, SETPOINT: 143, TIMESYNC: 34}
+HEARTBEAT, PARAMETER_VALUE, LOCAL_POSITION, GLOBAL_POSITION, SETPOINT, TIMESYNC = 0, 22, 32, 33, 84, 111
+EXTRA = {
+    HEARTBEAT: 50, PARAMETER_VALUE: 220, LOCAL_POSITION: 185, GLOBAL_POSITION: 104, SETPOINT: 143, TIMESYNC: 34
+}  # fmt: skip
 """CRC_EXTRA of each of these messages."""
 FRAME_BYTES = 280
 """The longest frame: 10 bytes of header, 255 of payload, 2 of checksum, 13 of signature."""
@@ -115,8 +117,8 @@ def _put_float(frame: Frame, at: int, value: float) -> None:
 
 
 @kernel
-def finish(vehicle: Record, frame: Frame, extra: int) -> int:
-    """Complete a vehicle's next frame, which already has its message id, payload and payload size.
+def finish(vehicle: Record, frame: Frame) -> int:
+    """Complete the next frame of a frequent message, which already has its message id, payload and payload size.
 
     Returns the size of the frame.
     """
@@ -128,15 +130,9 @@ def finish(vehicle: Record, frame: Frame, extra: int) -> int:
     frame[4], frame[5], frame[6] = vehicle.sequence, vehicle.wire_id, AUTOPILOT
     frame[8], frame[9] = 0, 0
     vehicle.sequence = (vehicle.sequence + 1) & 0xFF
-    crc = checksum(frame, end, extra)
+    crc = checksum(frame, end, _EXTRAS[int(frame[7])])
     frame[end], frame[end + 1] = crc & 0xFF, crc >> 8
     return end + 2
-
-
-@kernel
-def _finish(vehicle: Record, frame: Frame) -> int:
-    """Complete the frame of a frequent message."""
-    return finish(vehicle, frame, _EXTRAS[int(frame[7])])
 
 
 @kernel
@@ -153,7 +149,7 @@ def local_position(
     _put_float(frame, PAYLOAD + 20, v_east)
     _put_float(frame, PAYLOAD + 24, v_down)
     frame[1], frame[7] = 28, LOCAL_POSITION
-    return _finish(vehicle, frame)
+    return finish(vehicle, frame)
 
 
 @kernel
@@ -172,7 +168,7 @@ def global_position(
     _put_int(frame, PAYLOAD + 24, 2, clipped(v_down * 1e2, INT16))
     _put_int(frame, PAYLOAD + 26, 2, round(math.degrees(yaw_rad) % 360.0 * 1e2) % 36_000)
     frame[1], frame[7] = 28, GLOBAL_POSITION
-    return _finish(vehicle, frame)
+    return finish(vehicle, frame)
 
 
 @kernel
@@ -192,7 +188,7 @@ def heartbeat(
     frame[PAYLOAD + 7] = _CRITICAL if critical else _ACTIVE if flying else _STANDBY
     frame[PAYLOAD + 8] = _VERSION
     frame[1], frame[7] = 9, HEARTBEAT
-    return _finish(vehicle, frame)
+    return finish(vehicle, frame)
 
 
 @kernel
@@ -201,4 +197,4 @@ def timesync(vehicle: Record, frame: Frame, tc1: int, ts1: int) -> int:
     _put_int(frame, PAYLOAD + 0, 8, tc1)
     _put_int(frame, PAYLOAD + 8, 8, ts1)
     frame[1], frame[7] = 16, TIMESYNC
-    return _finish(vehicle, frame)
+    return finish(vehicle, frame)

@@ -62,6 +62,7 @@ def new_vehicles(n: int) -> Records:
     return vehicles
 
 
-def place_in(vehicles: Records, row: int = 0) -> Place:
-    """The place of one row in an array of `VEHICLE`."""
-    return Place(vehicles, Columns(vehicles), row)
+def new_place() -> Place:
+    """The place of a vehicle on its own."""
+    vehicles = new_vehicles(1)
+    return Place(vehicles, Columns(vehicles), 0)

@@ -7,6 +7,7 @@ reason; nothing is raised.
 
 import struct
 from collections import Counter
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scenarios.kernel import Cell, at_row
 from scenarios.networks import wire_id
 from sim_vehicles.services import frames
-from sim_vehicles.services.frames import ARDUPILOT, NO_MESSAGE
+from sim_vehicles.services.frames import ARDUPILOT, AUTOPILOT, HEARTBEAT, LOCAL_NED, NO_MESSAGE, STATION_TYPE
 from sim_vehicles.services.hot import Place
 from sim_vehicles.services.messages import REQUESTS, Condition, Message, Request
 
@@ -24,14 +25,10 @@ MAGIC_1, MAGIC_2 = dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2
 HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialect.MAVLINK_SIGNATURE_BLOCK_LEN
 SIGNED = dialect.MAVLINK_IFLAG_SIGNED
 
-COMPONENT_AUTOPILOT = dialect.MAV_COMP_ID_AUTOPILOT1
-UINT32 = 0xFFFFFFFF
-TYPE_GCS = dialect.MAV_TYPE_GCS
 MODE_STABILIZE, MODE_GUIDED, MODE_LOITER, MODE_BRAKE = 0, 4, 5, 17
 MODE_RETURN, MODE_LAND = 6, 9
 BASE_MODE_CUSTOM = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 SEVERITY_CRITICAL, SEVERITY_WARNING = dialect.MAV_SEVERITY_CRITICAL, dialect.MAV_SEVERITY_WARNING
-FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
 
 COMMAND_MODE, COMMAND_ARM = dialect.MAV_CMD_DO_SET_MODE, dialect.MAV_CMD_COMPONENT_ARM_DISARM
 COMMAND_TAKEOFF, COMMAND_LAND = dialect.MAV_CMD_NAV_TAKEOFF, dialect.MAV_CMD_NAV_LAND
@@ -43,13 +40,8 @@ COMMAND_INTERVAL, COMMAND_REQUEST = dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialec
 ACCEPTED, DENIED = dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
 UNSUPPORTED = dialect.MAV_RESULT_UNSUPPORTED
 
-HEARTBEAT = dialect.MAVLINK_MSG_ID_HEARTBEAT
-LOCAL_POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 POSITION_TARGET = dialect.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED
-GLOBAL_POSITION = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
-SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
 COMMAND_LONG, COMMAND_INT = dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT
-TIMESYNC = dialect.MAVLINK_MSG_ID_TIMESYNC
 AUTOPILOT_VERSION = dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 HOME_POSITION = dialect.MAVLINK_MSG_ID_HOME_POSITION
 GLOBAL_ORIGIN = dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
@@ -75,12 +67,12 @@ class Setpoint(NamedTuple):
     time_boot_ms: int
     velocity_ned_m_s: Triple
     acceleration_ned_m_s2: Triple
-    yaw_rad: float
-    yaw_rate_rad_s: float
-    type_mask: int
-    target_system: int
-    target_component: int
-    frame: int
+    yaw_rad: float = 0.0
+    yaw_rate_rad_s: float = 0.0
+    type_mask: int = 0
+    target_system: int = 0
+    target_component: int = 0
+    frame: int = LOCAL_NED
 
 
 class Command(NamedTuple):
@@ -149,7 +141,7 @@ def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Read]]
 def is_for(message: Asked, system_id: int) -> bool:
     """Whether a message is addressed to this vehicle: to its autopilot, or to all of its components."""
     # SET_MODE names no component
-    return message.target_system == system_id and getattr(message, "target_component", 0) in (0, COMPONENT_AUTOPILOT)
+    return message.target_system == system_id and getattr(message, "target_component", 0) in (0, AUTOPILOT)
 
 
 def in_version_1(frame: bytes) -> bytes:
@@ -181,10 +173,10 @@ def _append(messages: list[tuple[int, Read]], frame: bytes, checked: int, counte
     """Decode one frame with a valid checksum; `checked` is the end of its payload."""
     number = frame[7] | frame[8] << 8 | frame[9] << 16
     # Most traffic is these two messages, so they are decoded without pymavlink's objects.
-    if number == SETPOINT:
+    if number == frames.SETPOINT:
         values = _values(_SETPOINT.unpacker, frame, checked)
         messages.append((frame[5], Setpoint(values[0], values[4:7], values[7:10], *values[10:])))
-    elif number == TIMESYNC:
+    elif number == frames.TIMESYNC:
         # The target is an extension field that this dialect does not have yet.
         target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
         tc1, ts1 = _values(_TIMESYNC.unpacker, frame, checked)
@@ -226,33 +218,27 @@ class Encoder:
     def __init__(self, place: Place) -> None:
         self._vehicles, self._columns, self._row = place
         self.wire_id: int = self._columns["wire_id"][self._row]
-        self._pymavlink = dialect.MAVLink(None, srcSystem=self.wire_id, srcComponent=COMPONENT_AUTOPILOT)
+        self._pymavlink = dialect.MAVLink(None, srcSystem=self.wire_id, srcComponent=AUTOPILOT)
         self._frame = np.zeros(frames.FRAME_BYTES, np.uint8)
 
     def local_position(self, time_boot_ms: int, position: Triple, velocity: Triple) -> bytes:
         """LOCAL_POSITION_NED in m and m/s."""
-        size = _local_position_at(self._vehicles, self._row, self._frame, time_boot_ms, *position, *velocity)
-        return self._frame[:size].tobytes()
+        return self._made(_local_position_at, time_boot_ms, *position, *velocity)
 
     def global_position(self, at: Condition) -> bytes:
         """GLOBAL_POSITION_INT; without a position, latitude and longitude are zero, as ArduPilot sends them."""
         place = at.place_deg if at.has_position else (0.0, 0.0)
-        size = _global_position_at(
-            self._vehicles, self._row, self._frame,
-            at.time_boot_ms, *place, at.altitude_m, *at.velocity_ned_m_s, at.attitude_rad[2],
-        )  # fmt: skip
-        return self._frame[:size].tobytes()
+        values = at.time_boot_ms, *place, at.altitude_m, *at.velocity_ned_m_s, at.attitude_rad[2]
+        return self._made(_global_position_at, *values)
 
     def heartbeat(
         self, mode: int, *, armed: bool, flying: bool, critical: bool, guided: bool = False, autopilot: int = ARDUPILOT
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
-        size = _heartbeat_at(self._vehicles, self._row, self._frame, mode, autopilot, armed, guided, flying, critical)
-        return self._frame[:size].tobytes()
+        return self._made(_heartbeat_at, mode, autopilot, armed, guided, flying, critical)
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
-        size = _timesync_at(self._vehicles, self._row, self._frame, tc1, ts1)
-        return self._frame[:size].tobytes()
+        return self._made(_timesync_at, tc1, ts1)
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
         system, component = requester
@@ -266,10 +252,14 @@ class Encoder:
         return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
 
     def frame(self, number: int, payload: bytes) -> bytes:
-        """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
+        """The frame of a frequent message, without pymavlink's objects."""
         self._frame[frames.PAYLOAD : frames.PAYLOAD + len(payload)] = np.frombuffer(payload, np.uint8)
         self._frame[1], self._frame[7] = len(payload), number
-        size = _finish_at(self._vehicles, self._row, self._frame, CRC_EXTRA[number][0])
+        return self._made(_finish_at)
+
+    def _made(self, make: Callable[..., int], *values: float) -> bytes:
+        """The frame that a kernel makes from these values."""
+        size = make(self._vehicles, self._row, self._frame, *values)
         return self._frame[:size].tobytes()
 
     def pack(self, message: Message) -> bytes:
@@ -283,16 +273,14 @@ def rehearsal(system_id: int) -> list[bytes]:
     """Frames with which a station prepares a vehicle for flight, and its first set-points."""
     system_id = wire_id(system_id)
     station = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    none = 0.0
+    command: Any = dialect.MAVLink_command_long_message
+    zeros = (0.0,) * 6
     messages = (
-        dialect.MAVLink_heartbeat_message(TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3),
+        dialect.MAVLink_heartbeat_message(STATION_TYPE, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3),
         dialect.MAVLink_timesync_message(0, 1),
-        dialect.MAVLink_command_long_message(
-            system_id, 1, COMMAND_MODE, 0, BASE_MODE_CUSTOM, MODE_GUIDED, none, none, none, none, none
-        ),
-        dialect.MAVLink_command_long_message(system_id, 1, COMMAND_ARM, 0, 1.0, none, none, none, none, none, none),
+        command(system_id, 1, COMMAND_MODE, 0, BASE_MODE_CUSTOM, MODE_GUIDED, *zeros[1:]),
+        command(system_id, 1, COMMAND_ARM, 0, 1.0, *zeros),
     )
     set_point: Any = dialect.MAVLink_set_position_target_local_ned_message
-    zeros = (none,) * 6
-    flown = [set_point(ms, system_id, 1, FRAME_LOCAL_NED, 0x0C3F, *zeros, 0.5, -0.5, none, none, none) for ms in (1, 2)]
+    flown = [set_point(ms, system_id, 1, LOCAL_NED, 0x0C3F, *zeros, 0.5, -0.5, *zeros[:3]) for ms in (1, 2)]
     return [message.pack(station) for message in (*messages, *flown)]

@@ -26,7 +26,6 @@ Request = ParameterList | ParameterRead | ParameterSet | TextRead | Mission | Fi
 REQUESTS = frozenset(kind.id for kind in get_args(Request))
 """Message ids of all requests."""
 
-PARAMETER_VALUE = dialect.MAVLINK_MSG_ID_PARAM_VALUE
 NAMED_INT = dialect.MAVLINK_MSG_ID_NAMED_VALUE_INT
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 EKF_STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT

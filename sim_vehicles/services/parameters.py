@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from sim_vehicles.services import messages
+from sim_vehicles.services.frames import PARAMETER_VALUE
 from sim_vehicles.services.mavlink import Encoder
 from sim_vehicles.services.messages import ParameterList, ParameterRead, ParameterSet
 
@@ -101,7 +102,7 @@ class Parameters:
         data = _INT.pack(int(value)) if self.bytewise and whole else _FLOAT.pack(value)
         place = len(self._names), self._names.index(name)
         payload = _PARAMETER_VALUE.pack(data, *place, name.encode("ascii"), _kind(whole))
-        return encoder.frame(messages.PARAMETER_VALUE, payload)
+        return encoder.frame(PARAMETER_VALUE, payload)
 
     def _read(self, whole: bool, message: ParameterSet) -> float:
         """The value that a message sets; NaN if it is not valid."""
@@ -122,14 +123,9 @@ def timeout(name: str, value_s: float) -> Parameter:
     return Parameter(name, value_s, min(low, value_s), max(high, value_s))
 
 
-def fixed(name: str, value: int) -> Parameter:
-    """A whole number that cannot be changed in flight."""
-    return Parameter(name, value, value, value, whole=True)
-
-
-def limit(name: str, value: float) -> Parameter:
-    """A limit of the vehicle's motion, which cannot be changed in flight."""
-    return Parameter(name, value, value, value)
+def fixed(name: str, value: float) -> Parameter:
+    """A parameter that cannot be changed in flight, such as a limit of the vehicle's motion."""
+    return Parameter(name, value, value, value, whole=isinstance(value, int))
 
 
 _ARDUPILOT_VALUES: dict[str, float] = {

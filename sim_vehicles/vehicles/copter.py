@@ -13,12 +13,13 @@ import numpy as np
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
+from sim_vehicles.links.truth import ACTED
 from sim_vehicles.motion.air import Air
-from sim_vehicles.motion.copter import Motion, Target, advance, shifted
+from sim_vehicles.motion.copter import Motion, Target, advance, pushed
 from sim_vehicles.motion.double_integrator import State, state_from
 from sim_vehicles.motion.lagged import inner_of
 from sim_vehicles.motion.navigation import Navigator
-from sim_vehicles.services import mavlink, messages
+from sim_vehicles.services import frames, mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
 from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
@@ -32,8 +33,8 @@ HOME_M = 0.5
 """Distance to home at which a return becomes a landing."""
 SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
 REPORTED = (
-    mavlink.LOCAL_POSITION, mavlink.POSITION_TARGET,
-    mavlink.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION,
+    frames.LOCAL_POSITION, mavlink.POSITION_TARGET,
+    frames.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION,
 )  # fmt: skip
 """Messages that can be requested besides the estimator's and those of every vehicle."""
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
@@ -161,7 +162,7 @@ class Copter:
         if not self.landed:
             self._takeoff_m = None  # a set-point ends a guided take-off at the present altitude
             self._target = target
-            self._radio.acted(setpoint.time_boot_ms, time_ns)
+            self._radio.record(ACTED, setpoint.time_boot_ms, time_ns)
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
@@ -255,17 +256,17 @@ class Copter:
         """The frame of one of its messages; None if it has nothing to report, such as a position before it has one."""
         encoder, motion, ready = self._radio.encoder, self.motion, self._ready(time_ns)
         origin_north_m, origin_east_m, origin_up_m = self.origin_neu_m
-        boot_ms &= mavlink.UINT32
-        if message_id == mavlink.HEARTBEAT:
+        boot_ms &= frames.UINT32
+        if message_id == frames.HEARTBEAT:
             kind, flying = self.rules.autopilot, not self.landed
             return encoder.heartbeat(self.mode, armed=self.armed, flying=flying, critical=self.failsafe, autopilot=kind)
-        if message_id == mavlink.LOCAL_POSITION and ready:
+        if message_id == frames.LOCAL_POSITION and ready:
             down_m = origin_up_m - motion.altitude_m
             place, velocity = (motion.north_m - origin_north_m, motion.east_m - origin_east_m), motion[2:4]
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             return encoder.local_position(boot_ms, (*place, down_m), (*velocity, -motion.climb_m_s))
-        if message_id == mavlink.GLOBAL_POSITION:
+        if message_id == frames.GLOBAL_POSITION:
             return encoder.global_position(self._condition(boot_ms, has_position=ready))
         if message_id == self.rules.estimator_message:
             message = messages.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if ready else NOT_READY_FLAGS)
@@ -337,15 +338,10 @@ class Copter:
         """Motion and target at a later time."""
         if self._air is None:
             return advance(self.motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
-
-        def move(own: tuple[Motion, Target], duration_s: float) -> tuple[Motion, Target]:
-            return advance(*own, self.settings, duration_s)
-
-        def shift(own: tuple[Motion, Target], *by: float) -> tuple[Motion, Target]:
-            return shifted(own[0], *by), own[1]
-
         own = self.motion, self._target
-        return self._air.moved(own, move, shift, self._motion_ns, time_ns, foreseen=foreseen)
+        for piece in self._air.pieces(self._motion_ns, time_ns, foreseen=foreseen):
+            own = pushed(*own, self.settings, piece)
+        return own
 
     def move(self, time_ns: int) -> None:
         if time_ns <= self._motion_ns:

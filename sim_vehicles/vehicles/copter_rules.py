@@ -12,7 +12,7 @@ from scenarios.schema import Autopilot
 from sim_vehicles.motion.copter import Target
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.mavlink import Command, Setpoint
-from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, limit, timeout
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, timeout
 from sim_vehicles.vehicles import setpoints
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
@@ -123,28 +123,12 @@ def parameters(rules: Rules, system_id: int, settings: Autopilot) -> Parameters:
     ]
     jerk_m_s3 = settings.jerk_max_m_s3 or MOST_JERK_M_S3
     if rules is PX4:
-        known += [limit("MPC_ACC_HOR", settings.acceleration_max_m_s2), limit("MPC_JERK_AUTO", jerk_m_s3)]
+        known += [fixed("MPC_ACC_HOR", settings.acceleration_max_m_s2), fixed("MPC_JERK_AUTO", jerk_m_s3)]
         known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *PX4_SETUP]
     else:
-        known += [limit("WPNAV_ACCEL", 100.0 * settings.acceleration_max_m_s2), limit("PSC_JERK_XY", jerk_m_s3)]
+        known += [fixed("WPNAV_ACCEL", 100.0 * settings.acceleration_max_m_s2), fixed("PSC_JERK_XY", jerk_m_s3)]
         known += ARDUPILOT_SETUP
     return Parameters(known, bytewise=rules.parameters_bytewise)
-
-
-def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
-    """Interpret a set-point: (reason not to fly it or "", velocity counts, acceleration counts).
-
-    One ignored axis makes its whole vector ignored. A refused set-point makes ArduCopter stop; PX4 ignores it.
-    """
-    mask = setpoint.type_mask
-    velocity, acceleration = not mask & setpoints.VELOCITY_AXES, not mask & setpoints.ACCELERATION_AXES
-    if setpoint.frame not in setpoints.LOCAL_FRAMES and setpoint.frame not in setpoints.BODY_FRAMES:
-        return "refused_frame", False, False
-    if mask & setpoints.FORCE_SET and (acceleration or rules is PX4):
-        return "refused_force", False, False
-    if not mask & setpoints.POSITION_AXES or not (velocity or acceleration):
-        return "refused_mask", False, False  # flying to positions is not simulated
-    return "", velocity, acceleration
 
 
 def setpoint_target(
@@ -152,17 +136,25 @@ def setpoint_target(
 ) -> tuple[str, Target]:
     """The reason not to fly a set-point, or "", and the target that it sets for a vehicle with this yaw.
 
-    Ignored fields may hold anything, even NaN, which some clients send.
+    One ignored axis makes its whole vector ignored. Ignored fields may hold anything, even NaN, which some clients
+    send. A refused set-point makes ArduCopter stop; PX4 ignores it.
     """
-    reason, velocity_counts, acceleration_counts = setpoint_meaning(setpoint, rules)
+    mask = setpoint.type_mask
+    velocity_counts, acceleration_counts = not mask & setpoints.VELOCITY_AXES, not mask & setpoints.ACCELERATION_AXES
+    if setpoint.frame not in setpoints.LOCAL_FRAMES + setpoints.BODY_FRAMES:
+        return "refused_frame", Target()
+    if mask & setpoints.FORCE_SET and (acceleration_counts or rules is PX4):
+        return "refused_force", Target()
+    if not mask & setpoints.POSITION_AXES or not (velocity_counts or acceleration_counts):
+        return "refused_mask", Target()  # flying to positions is not simulated
     setpoint = setpoints.to_local(setpoint, yaw_rad)
     acceleration = setpoint.acceleration_ned_m_s2 if acceleration_counts else (0.0, 0.0, 0.0)
     velocity = setpoint.velocity_ned_m_s if velocity_counts else (0.0, 0.0, 0.0)
-    yaw = None if setpoint.type_mask & setpoints.YAW_IGNORED else setpoint.yaw_rad
-    rate = 0.0 if setpoint.type_mask & setpoints.YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
+    yaw = None if mask & setpoints.YAW_IGNORED else setpoint.yaw_rad
+    rate = 0.0 if mask & setpoints.YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
     if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= setpoints.ABSURD:
         return "refused_absurd", Target()
-    return reason, Target(
+    return "", Target(
         *acceleration[:2],
         *velocity[:2],
         velocity_gain_1_s=velocity_gain_1_s if velocity_counts else 0.0,

@@ -12,13 +12,14 @@ from scenarios.kernel import Cell, at_row
 from scenarios.keys.own import BUILT_IN, aircraft_of, names_code
 from scenarios.networks import wire_id
 from scenarios.schema import NS_PER_S
+from sim_vehicles.links.truth import ACTED
 from sim_vehicles.motion import double_integrator as motion
 from sim_vehicles.motion.air import Air, Push
 from sim_vehicles.motion.aircraft import Aircraft, Attitude
 from sim_vehicles.motion.double_integrator import COAST, VELOCITY_GAIN_1_S, Bounds, Command, State
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.motion.own import OwnMotion
-from sim_vehicles.services import mavlink, messages
+from sim_vehicles.services import frames, mavlink, messages
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
 from sim_vehicles.services.services import whole
@@ -49,8 +50,8 @@ class DoubleIntegrator:
     """The version of ArduCopter whose messages and modes it has."""
     version_1_first: bool = False
     intervals_us: Mapping[int, int] = {
-        mavlink.LOCAL_POSITION: 250_000,
-        mavlink.GLOBAL_POSITION: 1_000_000,
+        frames.LOCAL_POSITION: 250_000,
+        frames.GLOBAL_POSITION: 1_000_000,
         mavlink.HOME_POSITION: 0,
         mavlink.POSITION_TARGET: 0,
     }
@@ -157,7 +158,7 @@ class DoubleIntegrator:
             self._state_ns = time_ns  # the launcher has held it until now
             self._radio.tell(time_ns, "flying")
         self.move(time_ns)
-        if setpoint.frame != mavlink.FRAME_LOCAL_NED:
+        if setpoint.frame != frames.LOCAL_NED:
             setpoint = setpoints.to_local(setpoint, self._state.yaw_rad)
         north, east, _ = setpoint.acceleration_ned_m_s2
         if onboard is not None:
@@ -169,7 +170,7 @@ class DoubleIntegrator:
             self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
         else:
             self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
-        self._radio.acted(setpoint.time_boot_ms, time_ns)
+        self._radio.record(ACTED, setpoint.time_boot_ms, time_ns)
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
@@ -265,9 +266,9 @@ class DoubleIntegrator:
         if message_id == STEP:
             self._step_onboard(time_ns, boot_ms)
             return None
-        boot_ms &= mavlink.UINT32
+        boot_ms &= frames.UINT32
         encoder = self._radio.encoder
-        if message_id == mavlink.HEARTBEAT:
+        if message_id == frames.HEARTBEAT:
             flight, critical = self.flight, self.flight.failsafe != ""
             guided = flight.mode == mavlink.MODE_GUIDED
             return encoder.heartbeat(
@@ -276,18 +277,18 @@ class DoubleIntegrator:
         if message_id == mavlink.HOME_POSITION:
             return encoder.pack(messages.home_position())
         self.move(time_ns)
-        if message_id == mavlink.LOCAL_POSITION:
+        if message_id == frames.LOCAL_POSITION:
             state = self._state
             place, velocity = state[0:2], state.velocity_ne_m_s()
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
-            climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
+            climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.attitude()[:2]
             down_m_s = 0.0 - climb_m_s  # not -0.0, whose sign bit would be sent
             return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
         if message_id in (mavlink.POSITION_TARGET, messages.NAMED_INT):
             return self._active_target(boot_ms) if message_id == mavlink.POSITION_TARGET else self._lag(boot_ms)
         condition = self._condition(boot_ms)
-        is_global = message_id == mavlink.GLOBAL_POSITION
+        is_global = message_id == frames.GLOBAL_POSITION
         return encoder.global_position(condition) if is_global else encoder.pack(messages.report(message_id, condition))
 
     def _lag(self, boot_ms: int) -> bytes | None:
@@ -349,12 +350,11 @@ class DoubleIntegrator:
 
     def _moved(self, own: Step, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
         """The state at a later time in flight, by its own motion and what the air adds."""
-        command = self._command
-
-        def move(state: State, duration_s: float) -> State:
-            return own(state, command, self._bounds, duration_s)
-
-        return air.moved(self._state, move, motion.shifted, self._state_ns, time_ns, foreseen=foreseen)
+        state, command = self._state, self._command
+        for t, half_north, half_east, north, east in air.pieces(self._state_ns, time_ns, foreseen=foreseen):
+            pushed = motion.shifted(state, 0.0, 0.0, half_north, half_east)
+            state = motion.shifted(own(pushed, command, self._bounds, t), north, east, half_north, half_east)
+        return state
 
     def _note_fault(self, text: str) -> None:
         """Count a step in which the user's own dynamics failed, and report the first."""

@@ -90,17 +90,8 @@ class ExternallyFlown:
             guided = craft.rules.guided_mode
         elif not craft.flight.armed:
             craft.flight.arm(True)
-        setpoint = mavlink.Setpoint(
-            time_boot_ms=0,
-            velocity_ned_m_s=(*velocity, 0.0),
-            acceleration_ned_m_s2=(*acceleration, 0.0),
-            yaw_rad=0.0,
-            yaw_rate_rad_s=0.0,
-            type_mask=VELOCITY_ACCELERATION | YAW_IGNORED | YAW_RATE_IGNORED,
-            target_system=0,
-            target_component=0,
-            frame=mavlink.FRAME_LOCAL_NED,
-        )
+        mask = VELOCITY_ACCELERATION | YAW_IGNORED | YAW_RATE_IGNORED
+        setpoint = mavlink.Setpoint(0, (*velocity, 0.0), (*acceleration, 0.0), type_mask=mask)
         if (craft.mode if isinstance(craft, Copter) else craft.flight.mode) != guided:
             craft.take_setpoint(setpoint, time_ns)  # PX4 enters OFFBOARD only while set-points arrive
             craft.change_mode(guided, time_ns)

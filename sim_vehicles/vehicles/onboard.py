@@ -52,7 +52,7 @@ class VehicleLoop:
         self._noise = own.position_noise_m, own.velocity_noise_m_s
         self._ahead = 0
         self._offset_m = 0.0, 0.0
-        self._on_spacing = self._on_velocity = (0.0, 0.0, 0.0, 0.0)
+        self._on_spacing = self._on_velocity = [0.0] * 4
         self._seen: tuple[int, Look] | None = None
         self._nominal_m_s: tuple[float, float] | None = None
         self._streamed_m_s2 = self._own_m_s2 = (0.0, 0.0)
@@ -62,10 +62,7 @@ class VehicleLoop:
         self.on = parameters["FORM_LOOP"] == 1.0
         self._ahead = int(parameters["FORM_AHEAD"])
         self._offset_m = parameters["FORM_OFF_N"], parameters["FORM_OFF_E"]
-        a, b, c, d = (parameters[name] for name in _NAMES_P)
-        self._on_spacing = a, b, c, d
-        a, b, c, d = (parameters[name] for name in _NAMES_V)
-        self._on_velocity = a, b, c, d
+        self._on_spacing, self._on_velocity = ([parameters[name] for name in names] for names in (_NAMES_P, _NAMES_V))
 
     def stream(self, velocity_m_s: tuple[float, float], acceleration_m_s2: tuple[float, float]) -> None:
         """Take v_d and w from a set-point."""

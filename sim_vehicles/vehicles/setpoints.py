@@ -2,7 +2,7 @@
 
 import math
 
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import frames
 from sim_vehicles.services.mavlink import Setpoint
 
 POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
@@ -22,7 +22,7 @@ def fault(setpoint: Setpoint) -> str:
     A set-point must carry the whole vector of velocity, of acceleration, or both. Yaw is ignored: the heading is the
     course.
     """
-    if setpoint.frame != mavlink.FRAME_LOCAL_NED and setpoint.frame not in BODY_FRAMES:
+    if setpoint.frame != frames.LOCAL_NED and setpoint.frame not in BODY_FRAMES:
         return "refused_frame"
     mask = setpoint.type_mask
     counts = mask & AXES
@@ -50,5 +50,5 @@ def to_local(setpoint: Setpoint, yaw_rad: float) -> Setpoint:
     return setpoint._replace(
         velocity_ned_m_s=turned(*setpoint.velocity_ned_m_s),
         acceleration_ned_m_s2=turned(*setpoint.acceleration_ned_m_s2),
-        frame=mavlink.FRAME_LOCAL_NED,
+        frame=frames.LOCAL_NED,
     )

@@ -6,27 +6,27 @@ time, however late `step` is called.
 """
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from scenarios import schema
 from scenarios.kernel import Cell
 from scenarios.networks import wire_id
-from sim_vehicles.links.truth import ACTED, SAMPLED, Recorder, rows_of
+from sim_vehicles.links.truth import SAMPLED, Recorder, rows_of
 from sim_vehicles.motion.double_integrator import State
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import frames, mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
 from sim_vehicles.services.frames import FRAME_BYTES
-from sim_vehicles.services.hot import COUNTED, Place, new_vehicles, place_in
-from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMode
+from sim_vehicles.services.hot import COUNTED, Place, new_place
+from sim_vehicles.services.messages import EXTRA, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
 from sim_vehicles.services.services import Services
 from sim_vehicles.services.sitl import backdating_ns
-from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, UNUSUAL, hear_at, report_at
+from sim_vehicles.vehicles.plain import MOVE_FIRST, SILENT, hear_at, report_at
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
@@ -61,7 +61,7 @@ class Radio:
         recorder: Recorder | None = None,
         place: Place | None = None,
     ) -> None:
-        self.place = place or place_in(new_vehicles(1))
+        self.place = place or new_place()
         for name, number in (("system_id", own.system_id), ("wire_id", wire_id(own.system_id))):
             self.place.columns[name][self.place.row] = number
         self.system_id = own.system_id
@@ -97,15 +97,10 @@ class Radio:
         """Note a change, for whoever runs the simulation."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
-    def acted(self, setpoint_boot_ms: int, time_ns: int) -> None:
-        """Record in the truth log that a set-point acts from now on."""
+    def record(self, kind: int, boot_ms: int, time_ns: int) -> None:
+        """Record in the truth log that a set-point has ACTED, or that the state in a position report was SAMPLED."""
         if self.recorder is not None:
-            self.recorder.add((ACTED, self.system_id, setpoint_boot_ms, time_ns, time_ns, time_ns))
-
-    def sampled(self, boot_ms: int, time_ns: int) -> None:
-        """Record in the truth log when the state in a position report was sampled."""
-        if self.recorder is not None:
-            self.recorder.add((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
+            self.recorder.add((kind, self.system_id, boot_ms & frames.UINT32, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
         self.clock = clock
@@ -167,11 +162,11 @@ class Shell(Generic[Flown]):
         self._backdating_ns = backdating_ns(scenario, radio.system_id)
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule
-        schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
-        schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
-        intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
+        schedule.add_once(frames.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
+        schedule.set_interval(frames.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
+        intervals_us = {**dict.fromkeys(EXTRA, 0), frames.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
         for message_id, interval_us in intervals_us.items():
-            begin_ns = radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
+            begin_ns = radio.start_ns if message_id == frames.HEARTBEAT else from_ns
             schedule.set_interval(message_id, interval_us, begin_ns)
         self.services = Services(
             radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
@@ -211,59 +206,45 @@ class Shell(Generic[Flown]):
                 craft.happen(deadline_ns)
             elif scheduled_ns >= end_ns:
                 return
-            elif not self._reports_plainly(scheduled_ns):
+            elif not (craft.is_plain and self._runs_plainly(report_at, scheduled_ns)):
                 self._report(*schedule.pop())
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
-        if self._speaks_version_1 and message_id != mavlink.HEARTBEAT:
+        if self._speaks_version_1 and message_id != frames.HEARTBEAT:
             return  # no station has been heard that could want it
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
-        if message_id == mavlink.TIMESYNC:
+        if message_id == frames.TIMESYNC:
             self._asked_ts1 = radio.clock.boot_ns(time_ns)
             frame = radio.encoder.timesync(0, self._asked_ts1)
-        elif message_id == PARAMETER_VALUE:
+        elif message_id == frames.PARAMETER_VALUE:
             frame = self.services.next_parameter(time_ns)
         else:
             own = craft.report(message_id, time_ns, boot_ms)
             if own is None:
                 return
             frame = mavlink.in_version_1(own) if self._speaks_version_1 else own
-            if message_id == mavlink.LOCAL_POSITION:
-                radio.sampled(boot_ms, time_ns)
+            if message_id == frames.LOCAL_POSITION:
+                radio.record(SAMPLED, boot_ms, time_ns)
         radio.send(frame, time_ns)
 
-    def _reports_plainly(self, time_ns: int) -> bool:
-        """Send the due report from a kernel, if possible; returns whether it was sent."""
+    def _runs_plainly(self, run: Callable[..., int], time_ns: int, *heard: Any) -> bool:
+        """Run an event of a plain craft, a report or what is heard, in a kernel; False if it is unusual."""
         radio, (vehicles, _, row) = self.radio, self.radio.place
-        size = report_at(vehicles, row, self._frames, radio.truth_rows) if self.craft.is_plain else UNUSUAL
-        if size == MOVE_FIRST:
-            self.craft.move(time_ns)
-            size = report_at(vehicles, row, self._frames, radio.truth_rows)
-        if size == UNUSUAL:
-            return False
-        radio.send(self._frames[1, :size].tobytes(), time_ns)
-        return True
-
-    def _hears_plainly(self, data: bytes, time_ns: int) -> bool:
-        """Act on a datagram in a kernel, if possible; returns whether it did."""
-        if not self.craft.is_plain or len(data) > FRAME_BYTES:
-            return False
-        radio, (vehicles, _, row) = self.radio, self.radio.place
-        received = np.frombuffer(data, np.uint8)
-        size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
+        arguments = vehicles, row, *heard, self._frames, radio.truth_rows
+        size = run(*arguments)
         if size == MOVE_FIRST:
             self.craft.move(self.craft.acts_at(time_ns))
-            size = hear_at(vehicles, row, received, time_ns, self._frames, radio.truth_rows)
-        if size == UNUSUAL:
-            return False
-        if size != SILENT:
+            size = run(*arguments)
+        if size > SILENT:
             radio.send(self._frames[1, :size].tobytes(), time_ns)
-        return True
+        return size >= SILENT
 
     def _receive(self, data: bytes, time_ns: int) -> None:
-        if self._hears_plainly(data, time_ns):
-            return
+        if self.craft.is_plain and len(data) <= FRAME_BYTES:
+            received = np.frombuffer(data, np.uint8)
+            if self._runs_plainly(hear_at, time_ns, received, time_ns):
+                return
         counters, authority = self.radio.counters, self.authority
         for source, message in mavlink.read_datagram(data, counters):
             self._speaks_version_1 = False
@@ -281,7 +262,7 @@ class Shell(Generic[Flown]):
                 self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
 
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
-        if heartbeat.type != mavlink.TYPE_GCS:
+        if heartbeat.type != frames.STATION_TYPE:
             self.radio.counters["ignored_heartbeat"] += 1
         elif not self.authority.hears(source, time_ns):
             self.radio.counters["ignored_not_the_station"] += 1

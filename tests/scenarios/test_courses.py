@@ -20,7 +20,7 @@ def test_changes_of_velocity_reach_but_keep_their_bounds(bounds: Bounds) -> None
     [change] = course.changes
     step_s = change.duration_s / 4000.0
     times_s = np.arange(change.from_s, change.until_s + step_s, step_s)
-    velocity = np.array([course.velocity_at(time_s) for time_s in times_s])
+    velocity = np.array([course.at(time_s).velocity_ne_m_s for time_s in times_s])
     acceleration = np.gradient(velocity, step_s, axis=0)
     jerk = np.gradient(acceleration, step_s, axis=0)
     used = np.hypot(*acceleration.T).max() / bounds.acceleration_m_s2
@@ -35,7 +35,7 @@ def test_waypoints_are_rounded_and_the_last_is_met() -> None:
     course = course_by_waypoints(Bounds(4.0, 3.0), POINTS, 25.0)
     step_s = course.end_s / 20_000
     middle_s = (np.arange(20_000) + 0.5) * step_s
-    path = np.cumsum([course.velocity_at(time_s) for time_s in middle_s], axis=0) * step_s
+    path = np.cumsum([course.at(time_s).velocity_ne_m_s for time_s in middle_s], axis=0) * step_s
     # the midpoint rule errs by step² / 24 times the change of acceleration: micrometres
     assert path[-1] == pytest.approx(POINTS[-1], abs=1e-3)
     for corner in POINTS[1:-1]:

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from gains.core.requirement import ALPHA_MIN, DELAY_MARGIN_MAX_S, Requirement
 from scenarios.errors import ScenarioError
-from scenarios.files import dump, fingerprint, load, parse
+from scenarios.files import checked, dump, fingerprint, load, parse
 from scenarios.schema import Control, Scenario
 from scenarios.shipped import columns
 from tests.support.paths import SCENARIOS
@@ -276,3 +276,15 @@ def test_bounds_of_requirements_are_those_of_designs() -> None:
 def test_a_link_delay_that_is_none_is_refused(delay_s: float) -> None:
     with pytest.raises(ScenarioError, match=r"triangle5: down_s: read .*, wanted a delay in seconds, from 0"):
         load(SCENARIOS / "triangle5.toml").with_link_delay(up_s=0.1, down_s=delay_s)
+
+
+def test_every_copter_must_have_an_altitude_to_take_off_to() -> None:
+    copters = load(SCENARIOS / "copters5.toml")
+
+    def flown_at(altitude_m: float, own_m: float) -> Scenario:
+        vehicles = tuple(vehicle.model_copy(update={"altitude_m": own_m}) for vehicle in copters.vehicles)
+        return checked(copters.model_copy(update={"altitude_m": altitude_m, "vehicles": vehicles}), FILE)
+
+    assert flown_at(0.0, 20.0).altitude_m == 0.0  # no vehicle flies at it
+    with pytest.raises(ScenarioError, match=r"vehicles\[0\]\.altitude_m: read 0, wanted an altitude above 0"):
+        flown_at(20.0, 0.0)

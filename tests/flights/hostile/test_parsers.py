@@ -17,12 +17,12 @@ from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.links import relay
 from sim_vehicles.services import mavlink as vehicles_mavlink
-from sim_vehicles.services.hot import new_vehicles, place_in
+from sim_vehicles.services.hot import new_place
 
 KEY = Key(bytes(range(32)))
 HEARTBEAT_2 = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=7)
 HEARTBEAT_1 = vehicles_mavlink.in_version_1(
-    vehicles_mavlink.Encoder(place_in(new_vehicles(1))).heartbeat(4, armed=False, flying=True, critical=False)
+    vehicles_mavlink.Encoder(new_place()).heartbeat(4, armed=False, flying=True, critical=False)
 )
 """Shorter than most, with a checksum that is right: what follows it is read as well."""
 SIGNED = SignedLink(KEY, link_id=0, crc_extra=mavlink.CRC_EXTRA, epoch_ns=0, stamps=Stamps()).sign(HEARTBEAT_2, 0)

@@ -71,7 +71,7 @@ def test_the_patrol_keeps_its_shape_and_crosses_at_its_altitudes() -> None:
     down_m = columns(flight.ticks, "down_m", 5)
     assert sorted(set(down_m[-1].tolist())) == [-315.0, -300.0]
     course, step_s = PATROL.smooth_course(), 0.002
-    path = np.cumsum([course.velocity_at(k * step_s) for k in range(round(40.0 / step_s))], axis=0) * step_s
+    path = np.cumsum([course.at(k * step_s).velocity_ne_m_s for k in range(round(40.0 / step_s))], axis=0) * step_s
     leader = np.stack([columns(flight.ticks, f"{axis}_m", 5)[:, 0] for axis in ("north", "east")], axis=1)
     off_m = [np.hypot(*(path - place).T).min() for place in leader[::50]]
     # The leader's position is not controlled: it starts to turn one delivery late, 25 m/s * 0.06 s = 1.5 m along.

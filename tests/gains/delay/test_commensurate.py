@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks
+from gains.delay._commensurate import _roots_and_slopes  # pyright: ignore[reportPrivateUsage]
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed_block
 from gains.delay._windows import DelayAnalysis, combined_analysis
@@ -258,3 +259,15 @@ def test_pair_on_the_axis_at_no_delay_beside_a_fixed_root_at_zero() -> None:
         assert found == {
             round(sqrt(0.7418610417423701 * 0.6401019196602797 - 0.318665534371544 * 0.10632528972641878), 6)
         }
+
+
+def test_a_defective_angle_leaves_the_slopes_at_the_others() -> None:
+    # at the angle 0 three states form one Jordan block, whose eigenvectors are exactly parallel; elsewhere the terms
+    # D e^{-j theta} - D e^{-2 j theta} part its eigenvalues
+    chain, parts = np.zeros((4, 4)), np.diag([1.0, 2.0, 3.0, -1.0])
+    chain[0, 1] = chain[1, 2] = 1.0
+    theta = np.array([1.0, 2.0])
+    shift = np.exp(-1j * theta) * -1j - np.exp(-2j * theta) * -2j
+    _, slopes = _roots_and_slopes([chain, parts, -parts], np.append(0.0, theta))
+    expected = np.multiply.outer(shift.real, np.diag(parts))
+    assert np.sort(slopes[1:], axis=1) == pytest.approx(np.sort(expected, axis=1), rel=1e-9)

@@ -81,3 +81,17 @@ def test_error_of_a_margin_of_too_large_a_map_is_not_known() -> None:
     found = margin_of(np.zeros((1, 1)), np.eye(1), -np.eye(1), 0.004)  # pi / 2 s are 393 periods
     assert np.isnan(found.delay_margin_error_s)
     assert found.crossings == found.checked_by == ()
+
+
+@pytest.mark.parametrize("across", [3, 5, 8])
+@pytest.mark.parametrize("share", [2.0**-16, 2.0**-19, 2.0**-25])
+def test_error_bounds_a_period_beside_a_double_eigenvalue(across: int, share: float) -> None:
+    # p'' = -k p - p' held for T has a pair on the circle at T = 2 / k; with k = 1 it is double, at z = -1. Whole
+    # numbers of determinant one mix the states without rounding.
+    mixed = np.array([[1.0, across], [12.0, 1.0 + 12.0 * across]])
+    back = np.array([[1.0 + 12.0 * across, -across], [-12.0, 1.0]])
+    k = 1.0 + share
+    found = margin_of(
+        back @ [[0.0, 1.0], [0.0, 0.0]] @ mixed, back @ [[0.0], [1.0]], np.array([[-k, -1.0]]) @ mixed, None
+    )
+    assert abs(found.delay_margin_s - 2.0 / k) < found.delay_margin_error_s < 1e-4

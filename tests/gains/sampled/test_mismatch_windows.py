@@ -141,3 +141,22 @@ def test_a_short_stretch_of_instability_ends_the_window(
     loop: Loop, hertz: tuple[float, float], assumed_s: float
 ) -> None:
     assert_window(loop, Timing(*(1.0 / rate for rate in hertz)), assumed_s, looks=300)
+
+
+@pytest.mark.parametrize("followers", [2, 3, 4])
+@pytest.mark.parametrize("hertz", [(10.0, 10.0), (50.0, 20.0)])
+@pytest.mark.parametrize("assumed_s", [0.0, 1.0])
+def test_equal_followers_in_mixed_coordinates_have_the_window_of_one(
+    followers: int, hertz: tuple[float, float], assumed_s: float
+) -> None:
+    A, B, own = double_integrators(np.array([[-0.8, -1.5]]))
+    rates = Timing(*(1.0 / rate for rate in hertz))
+    alone_s = mismatch_window(A, B, own, rates, assumed_s=assumed_s)
+    together = [np.kron(np.eye(followers), matrix) for matrix in (A, B, own)]
+    K = together[2] + np.kron(np.eye(followers, k=-1), [[0.2, 0.5]])
+    mixed = np.linalg.qr(np.random.default_rng(1).standard_normal((2 * followers, 2 * followers)))[0]
+    loop = mixed @ together[0] @ mixed.T, mixed @ together[1], K @ mixed.T
+    # a chain: one eigenvalue of this multiplicity, which rounding of 1e-14 spreads by its root; twice that, as the
+    # gains between followers are not one
+    within = 2.0 * 1e-14 ** (1.0 / followers)
+    assert mismatch_window(*loop, rates, assumed_s=assumed_s) == pytest.approx(alone_s, rel=within)

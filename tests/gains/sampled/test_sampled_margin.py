@@ -206,3 +206,14 @@ def test_a_stable_plant_with_small_gain_has_no_period_limit() -> None:
 
 def test_period_limit_of_an_unstable_loop_is_zero() -> None:
     assert analyse_period([[1.0]], [[1.0]], [[-0.5]]).limit_s == 0.0
+
+
+@pytest.mark.parametrize("gain", [4.882, 4.8875])
+def test_a_loop_unstable_at_few_fractions_of_a_period_has_a_margin(gain: float) -> None:
+    # a damped oscillation, sampled less than once: its loci have modulus one at a fiftieth of all fractions
+    loop = [[0.0, 1.0], [-23.0, -1.4]], [[0.0], [1.0]], gain * np.array([[-0.5, 0.6]])
+    looks = np.arange(0.0, 12.0, 0.005)
+    radii = [spectral_radius(*loop, period_s=1.0, delay_s=float(delay_s)) for delay_s in looks]
+    first_s = float(looks[np.flatnonzero(np.array(radii) >= 1.0)[0]])
+    margin_s = sampled_delay_margin(*loop, period_s=1.0)
+    assert first_s - 0.005 <= margin_s <= first_s

@@ -4,16 +4,19 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from scenarios.kernel import at_row
 from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
 from scenarios.schema import Autopilot, Limits, Scenario
 from sim_vehicles.links.truth import POSITION_ERROR, PUSHED, VELOCITY_ERROR, MemoryRecorder, disturbances
 from sim_vehicles.motion import air, copter
-from sim_vehicles.motion.double_integrator import Command, State, advance, bounds_of, shifted, state_from
+from sim_vehicles.motion.double_integrator import Command, State, bounds_of, push_on, state_from
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.motion.sector import AllPass, SectorBound
+from sim_vehicles.services.hot import new_vehicles
 from tests.support.sim_client import SECOND, START, scenario
 
 GUSTS = Gusts(deviation_m_s2=0.5, correlation_time_s=0.2)
+PUSH_ON_AT = at_row(push_on)
 UNLIMITED = bounds_of(Limits())
 
 
@@ -48,11 +51,12 @@ def test_forgotten_gusts_leave_the_later_ones_as_they_were() -> None:
 def moved(flown: Scenario, to_ns: int, recorder: MemoryRecorder, *, push: air.Push = air.STILL) -> State:
     around = air.Air(flown, 1, START, recorder)
     around.add(push)
-
-    def move(state: State, duration_s: float) -> State:
-        return advance(state, Command(1.0, -0.5), UNLIMITED, duration_s)
-
-    return around.moved(state_from((0.0, 0.0), (40.0, 9.0)), move, shifted, START, to_ns)
+    vehicles = new_vehicles(1)
+    vehicles["state"], vehicles["command"] = state_from((0.0, 0.0), (40.0, 9.0)), Command(1.0, -0.5)
+    vehicles["bounds"] = UNLIMITED
+    for piece in around.pieces(START, to_ns):
+        PUSH_ON_AT(vehicles, 0, piece)
+    return State(*vehicles["state"][0].tolist())
 
 
 def test_constant_push_adds_to_the_command_as_in_closed_form() -> None:
@@ -78,14 +82,11 @@ def test_wind_moves_a_copter_as_its_equations_say() -> None:
     limits = Autopilot(acceleration_max_m_s2=50.0)
     around = air.Air(disturbed(wind_ne_m_s2=(0.4, 0.0)), 1, START, None)
     target = copter.Target(velocity_north_m_s=3.0, velocity_gain_1_s=2.0)
-
-    def move(motion: copter.Motion, duration_s: float) -> copter.Motion:
-        return copter.advance(motion, target, limits, duration_s)[0]
-
     motion = copter.Motion(0.0, 0.0)
     for k in range(200):
         at_ns = START + k * air.STEP_NS
-        motion = around.moved(motion, move, copter.shifted, at_ns, at_ns + air.STEP_NS)
+        for piece in around.pieces(at_ns, at_ns + air.STEP_NS):
+            motion, target = copter.pushed(motion, target, limits, piece)
 
     def rates(_: float, x: np.ndarray) -> list[float]:
         return [x[1], x[2] + 0.4, (2.0 * (3.0 - x[1]) - x[2]) / limits.lag_s]

@@ -13,6 +13,7 @@ from sim_vehicles.services.mavlink import message_id
 def test_message_ids_and_extras_are_those_of_the_dialect() -> None:
     for message, number in (
         (dialect.MAVLink_heartbeat_message, frames.HEARTBEAT),
+        (dialect.MAVLink_param_value_message, frames.PARAMETER_VALUE),
         (dialect.MAVLink_local_position_ned_message, frames.LOCAL_POSITION),
         (dialect.MAVLink_global_position_int_message, frames.GLOBAL_POSITION),
         (dialect.MAVLink_set_position_target_local_ned_message, frames.SETPOINT),

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import frames, mavlink
 from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.support.fleets.vehicle_kinds import VEHICLES
 from tests.support.sim_client import SECOND, START, a_vehicle, arm, command, guided, heartbeat, pack, parse_all
@@ -82,6 +82,6 @@ def test_frames_are_numbered_in_the_order_sent(make: Make) -> None:
 def test_a_level_vehicle_sends_no_byte_of_its_vertical_velocity() -> None:
     """Trailing zeros are omitted; a velocity of -0.0 would not be, and a slow radio would carry fewer vehicles."""
     sent = a_vehicle().step([(command(511, 32, 100_000), START + SECOND)], START + 3 * SECOND)
-    positions = [frame for frame, _ in sent if mavlink.message_id(frame) == mavlink.LOCAL_POSITION]
+    positions = [frame for frame, _ in sent if mavlink.message_id(frame) == frames.LOCAL_POSITION]
     assert len(positions) > 10
     assert max(frame[1] for frame in positions) <= dialect.MAVLink_local_position_ned_message.unpacker.size - 4
