@@ -132,6 +132,7 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     pattern = matrices[0] != 0.0
     for matrix in matrices[1:]:
         pattern |= matrix != 0.0
+    np.fill_diagonal(pattern, True)  # a state is connected to itself
     # shortcut for dense loops: every state drives the first one and is driven by it
     if bool(pattern[0].all() and pattern[:, 0].all()):
         return [np.arange(len(pattern))]
@@ -213,6 +214,8 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
     With units as different as rad and W, a norm, and a tolerance relative to it, says little about the dynamics. The
     similarity is exact: its entries are powers of two.
     """
+    if len(matrices[0]) == 1:
+        return matrices
     weight = np.sum([np.abs(matrix) for matrix in matrices], axis=0)
     np.fill_diagonal(weight, 0.0)
     size = weight.shape[0]

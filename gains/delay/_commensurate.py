@@ -81,8 +81,7 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     if not present:
         return []
     used = tuple(terms[: present[-1] + 1])
-    rank = column_space(used[1:]).shape[1]
-    if len(terms[0]) > LARGEST_ALGEBRAIC_BLOCK and rank > 1:
+    if len(terms[0]) > LARGEST_ALGEBRAIC_BLOCK and column_space(used[1:]).shape[1] > 1:
         try:
             tracked = tracked_crossings(used)
             return [c for c in tracked if not passes_zero(used, c.omega_rad_s * c.delay_s, c.omega_rad_s)]
@@ -96,13 +95,14 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
             for crossing in axis_crossings(terms[0], terms[k])
             for turn in range(k)
         ]
-    if (len(used) - 1) * rank > _LARGEST_LOCI:
+    space = column_space(used[1:])
+    if (len(used) - 1) * space.shape[1] > _LARGEST_LOCI:
         return _crossings_by_angle(used)
 
     def terms_at(omega: FloatArray) -> ComplexArray:
         return np.broadcast_to(np.array(used, dtype=np.complex128), (omega.size, len(used), *used[0].shape))
 
-    loci = companion_loci(terms_at, column_space(used[1:]))
+    loci = companion_loci(terms_at, space)
     return crossings_of_loci(used, loci, _candidates(used))
 
 

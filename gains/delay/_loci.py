@@ -200,15 +200,18 @@ def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list
     to the next, so all that cross at one frequency are read from one evaluation. Where the count goes up and down at
     one frequency, by rounding or because loci cross in opposite directions, each locus is followed on its own.
     """
-    order = np.argsort(omega, kind="stable")
-    omega, outward = omega[order], outward[order]
-    places = np.split(np.arange(omega.size), np.flatnonzero(np.diff(omega) > _SAME_PLACE * omega[1:]) + 1)
+    places: list[list[int]] = []
+    for place in np.argsort(omega, kind="stable").tolist():
+        if places and omega[place] - omega[places[-1][-1]] <= _SAME_PLACE * omega[place]:
+            places[-1].append(place)
+        else:
+            places.append([place])
     centres = np.array([omega[place].mean() for place in places])
     crossings: list[UnitCrossing] = []
     for place, centre, row in zip(places, centres.tolist(), loci(centres), strict=True):
         from_one = np.abs(_log(row))
-        if np.unique(outward[place]).size == 1 and place.size <= row.size:
-            nearest = row[np.argsort(from_one)[: place.size]].tolist()
+        if len({*outward[place].tolist()}) == 1 and len(place) <= row.size:
+            nearest = row[np.argsort(from_one)[: len(place)]].tolist()
             crossings += [UnitCrossing(centre, locus, int(outward[place[0]])) for locus in nearest]
         else:
             on_circle = row[from_one < _ON_CIRCLE].tolist()

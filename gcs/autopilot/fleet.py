@@ -31,6 +31,7 @@ class AutopilotFleet(Fleet):
     """Multicopters that start on the ground, each with its own local frame."""
 
     speaks_mavlink_1_first = True
+    together_ns = 8_000_000  # PX4 ignores an answer that arrives over 10 ms after its TIMESYNC request
     holds_when_left_alone = False
 
     def __init__(self, plan: FlightPlan, report: Report) -> None:

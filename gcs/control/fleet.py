@@ -29,6 +29,9 @@ class Fleet:
 
     speaks_mavlink_1_first = False
     """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
+    together_ns = 20_000_000
+    """Longest time that a datagram may wait to be read together with others. Reading late delays only answers: stamps
+    say when datagrams arrived, and decisions fall at ticks."""
     holds_when_left_alone = True
     """Whether a vehicle without set-points holds its velocity; an autopilot's failsafe may be to fly on."""
 

@@ -21,11 +21,13 @@ from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link.datagram import Address, Arrivals, Datagram, Frames, Outbox, Outgoing
+from gcs.plan.expected_delay import waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import MIRROR, RunWriter
 from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.station.station import Station
 from scenarios.networks import LAST_NETWORK
+from scenarios.schema import NS_PER_S
 from scenarios.sockets import Bytes, Ints, Reader, address_of, number_of, realtime_offset_ns, stamped, write
 
 _MOST_ADDRESSES = 8192
@@ -33,13 +35,12 @@ _MOST_ADDRESSES = 8192
 _NETWORK_BIT, _ADDRESS_BITS = 48, (1 << 48) - 1
 """First bit of the network in an address's key, and the mask of the bits below, which hold its `number_of`."""
 _TOGETHER_NS = 8_000_000
-"""Least time between two wake-ups for datagrams. Reading late costs nothing, because stamps say when datagrams arrived
-and decisions fall only at ticks. Answers cannot wait longer: PX4 ignores one that arrives over 10 ms after its TIMESYNC
-request."""
-_LONG_NS, _SOONER_NS = 500_000, 3_000_000
-"""If the work since the last wake-up took longer than the first time, the second replaces `_TOGETHER_NS`."""
+"""Longest time that a datagram usually waits for others, so that they are read in one wake-up."""
 _BEFORE_TICK_NS = 2_000_000
 """How long before a tick the sockets are read. In the time left, 250 vehicles send 30 datagrams."""
+_FEW = 25
+"""So many vehicles need so little work before a tick that requests can be sent then. In a channel with limited
+bandwidth, requests would delay the set-points: they are sent between ticks."""
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 
 
@@ -126,14 +127,14 @@ class StationSocket:
         host, port = own.getsockname()
         return host, port - network
 
-    def wait(self, until_ns: int) -> None:
-        """Wait until a datagram arrives or a time is reached; datagrams in quick succession cause one wake-up."""
-        now_ns = clock_ns()
-        left_ns, together_ns = until_ns - now_ns, _SOONER_NS if now_ns - self._woken_ns > _LONG_NS else _TOGETHER_NS
+    def wait(self, until_ns: int, together_ns: int = _TOGETHER_NS) -> None:
+        """Wait until a time is reached or a datagram has waited `together_ns` for others."""
+        busy_ns = clock_ns() - self._woken_ns
         if self._woken_ns + together_ns < until_ns:
-            select.select(self._wait_for, [], [], max(0, left_ns) * 1e-9)
-            left_ns = min(until_ns, self._woken_ns + together_ns) - clock_ns()
-        if left_ns > 0:
+            select.select(self._wait_for, [], [], max(0, until_ns - clock_ns()) * 1e-9)
+            # the datagram may have come right after the last wake-up
+            until_ns = min(until_ns, clock_ns() + together_ns - busy_ns)
+        if (left_ns := until_ns - clock_ns()) > 0:
             time.sleep(left_ns * 1e-9)
         self._woken_ns = clock_ns()
 
@@ -217,6 +218,14 @@ def drive(
     log = Frames()
     """Frames received and sent since the last tick, in order."""
     refusals = Refusals()
+    together_ns = station.together_ns if mirror is None else _TOGETHER_NS
+    is_light = (
+        len(station.vehicles) <= _FEW
+        and link.guard is None
+        and not waits_for_channels(plan.scenario)
+        and NS_PER_S / plan.scenario.rates.control_hz - _BEFORE_TICK_NS <= together_ns
+    )
+    """Whether one wake-up before each tick is enough, both to read datagrams and to send requests and heartbeats."""
 
     def log_refusals(now_ns: int, *, last: bool = False) -> None:
         if counts := refusals.news(station.counters, last=last):
@@ -226,11 +235,12 @@ def drive(
     while station.phase is not Phase.ENDED:
         # Datagrams are read shortly before the next tick is due: set-points then do not wait for that work.
         read_ns = station.next_tick_ns - _BEFORE_TICK_NS
-        link.wait(min(station.next_event_ns, read_ns if clock_ns() < read_ns else station.next_tick_ns))
+        wake_ns = read_ns if clock_ns() < read_ns else station.next_tick_ns
+        link.wait(wake_ns if is_light else min(wake_ns, station.next_event_ns), together_ns)
         now_ns = clock_ns()
         requests = Outbox()
-        if station.next_event_ns <= now_ns < station.next_tick_ns:
-            requests = station.step([], now_ns)[0]  # before the sockets are read, to send them in time
+        if not is_light and station.next_event_ns <= now_ns < station.next_tick_ns:
+            requests = station.step([], now_ns)[0]  # before many datagrams are read, to send them in time
             log.add(sent := link.send(requests))
             station.sent(requests, sent.table[3])
         datagrams = link.receive(station.counters, station.is_another)

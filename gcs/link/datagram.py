@@ -5,7 +5,7 @@ datagram that is read individually.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ class Frames:
         """Add the datagrams from index `first` up to `stop`; each must hold one frame."""
         table = arrivals.table[:, first:stop]
         if table.shape[1]:
-            self.parts.append(replace(arrivals, table=table))
+            self.parts.append(Arrivals(arrivals.stream, table, arrivals.queued_ns, arrivals.addresses))
 
     def take(self, other: "Frames") -> None:
         """Move all frames of another buffer into this one."""

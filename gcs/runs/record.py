@@ -83,6 +83,8 @@ class RunWriter:
     def event(self, *events: Event) -> None:
         """Log events, after the earlier ones that could not be written yet."""
         self._waiting += (replace(event, time_s=round(event.time_s, 6)) for event in events)
+        if not self._waiting:
+            return
         lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
         try:
             self._logs[EVENTS_FILE].add("".join(lines).encode())

@@ -86,7 +86,7 @@ class Station:
         """See `Journal`."""
         own = None if plan.law is None else FlownLaw(plan, journal.report, journal.request_stop, stopwatch_ns)
         self._fleet = fleet_of(plan, journal.report, own, strangers=strangers)
-        self.vehicles = self._fleet.vehicles
+        self.vehicles, self.together_ns = self._fleet.vehicles, self._fleet.together_ns
         n = len(self.vehicles)
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._reception = Reception(self._fleet, journal.report, start_ns=start_ns, period_ns=self._period_ns)
@@ -116,6 +116,7 @@ class Station:
             self._schedule[name] = value
         self._used_s, self._repeated_ns = np.full(n, nan), np.zeros((2, n), np.int64)
         self._scratch, self._due = new_scratch(n), np.zeros(1, DUE)
+        self._due_columns = Columns(self._due)
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
@@ -296,7 +297,7 @@ class Station:
 
     def _usual_tick(self, outgoing: Outbox) -> Tick | None:
         """Do the tick due now with a kernel if possible, else return None."""
-        due_ns, due = self.next_tick_ns, Columns(self._due)
+        due_ns, due = self.next_tick_ns, self._due_columns
         if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(due, 1):
             return None
         done, set_points = usual_set_points(self.usual, self._due)

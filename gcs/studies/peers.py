@@ -144,7 +144,8 @@ def _margins() -> Iterator[Row]:
     """The delay margin of a follower's loop L(s) = (K3 - K1 s) / s²: phase margin over crossover frequency."""
     control: Any = import_module("control")
     loop = control.tf([-GAINS.K1, GAINS.K3], [1.0, 0.0, 0.0])
-    A0, A1 = FormationModel((-1, 0), axes=1).ground_loop([[GAINS.K1]], [[GAINS.K2]], [[GAINS.K3]])
+    whole = FormationModel((-1, 0), axes=1).ground_loop([[GAINS.K1]], [[GAINS.K2]], [[GAINS.K3]])
+    A0, A1 = (matrix[1:, 1:] for matrix in whole)  # without the leader's velocity
 
     def theirs() -> float:
         _, phase_deg, _, _, crossover_rad_s, _ = control.stability_margins(loop, returnall=True)

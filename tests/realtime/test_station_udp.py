@@ -43,6 +43,19 @@ def test_a_datagram_arrives_between_sending_and_reading_and_waits() -> None:
             assert waited_ns[25] >= wait_ns - 50_000  # the kernel may hand single ones over late
 
 
+def test_a_datagram_waits_for_others_as_long_as_it_may() -> None:
+    with StationSocket("127.0.0.1", 0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        waited_ns: list[int] = []
+        for _ in range(15):
+            link.wait(clock_ns())
+            begun_ns = clock_ns()
+            peer.sendto(b"", link.address)
+            link.wait(begun_ns + 200_000_000, 10_000_000)
+            waited_ns.append(clock_ns() - begun_ns)
+            assert len(link.receive()) == 1
+        assert 9_000_000 < sorted(waited_ns)[7] < 30_000_000
+
+
 def test_senders_are_known_by_their_addresses_however_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gcs.drive.udp._MOST_ADDRESSES", 10)
     with StationSocket("127.0.0.1", 0) as link:

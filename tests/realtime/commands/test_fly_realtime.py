@@ -72,25 +72,32 @@ def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, d
     for name in ("flight.rrd", "flight.tlog", "scenario.toml", "design.json", "ticks.parquet"):
         assert (folder / name).stat().st_size > 100
     assert {"flight.rrd", "flight.tlog", "ticks.parquet", "summary.json"} <= set(summary["files"])
-    check_tlog(folder / "flight.tlog")
+    frames = check_tlog(folder / "flight.tlog")
+    sent = [(time_us, frame) for time_us, frame in frames if frame.get_srcSystem() == 255]
+    set_points_us = [time_us for time_us, frame in sent if frame.get_type() == "SET_POSITION_TARGET_LOCAL_NED"]
+    requests_us = [t_us for t_us, frame in sent if frame.get_type() == "TIMESYNC" and frame.tc1 == 0]
+    requests_us = [t_us for t_us in requests_us if set_points_us[0] < t_us < set_points_us[-1]]
+    next_us = np.array(set_points_us)[np.searchsorted(set_points_us, requests_us)]
+    # the one wake-up between two ticks is 2 ms before the second; half a period would be 10 ms
+    assert float(np.median(next_us - requests_us)) < 5e3
 
 
-def check_tlog(file: Path) -> None:
+def check_tlog(file: Path) -> list[tuple[int, Any]]:
     """Every entry is a time and one frame that pymavlink accepts; times run forwards but for what a tick collects."""
     parser: Any = dialect.MAVLink(None)
     data = file.read_bytes()
-    at, times, kinds = 0, [], set[str]()
+    at, frames = 0, list[tuple[int, Any]]()
     while at < len(data):
         (time_us,) = struct.unpack_from(">Q", data, at)
         length = 12 + data[at + 9]
-        message = parser.parse_char(data[at + 8 : at + 8 + length])
-        kinds.add(message.get_type())
-        times.append(time_us)
+        frames.append((time_us, parser.parse_char(data[at + 8 : at + 8 + length])))
         at += 8 + length
     assert at == len(data)
+    times, kinds = [time_us for time_us, _ in frames], {message.get_type() for _, message in frames}
     assert {"HEARTBEAT", "LOCAL_POSITION_NED", "TIMESYNC", "SET_POSITION_TARGET_LOCAL_NED", "COMMAND_ACK"} <= kinds
     assert abs(times[0] * 1e-6 - time.time()) < 3600
     assert min(np.diff(times)) > -1e6
+    return frames
 
 
 def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
