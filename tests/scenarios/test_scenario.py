@@ -91,8 +91,6 @@ BAD = {
     "not a number": ("[91.44, 0.0]", "[nan, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "finite"),
     "infinite": ("duration_s = 40.0", "duration_s = inf", "duration_s", "finite"),
     "beyond single precision": ("altitude_m = 1000.0", "altitude_m = 1e300", "altitude_m", "1000000"),
-    "no altitude": ("altitude_m = 1000.0", 'dynamics = "autopilot"', "altitude_m", "to take off to"),
-    "too high": ("altitude_m = 1000.0", 'altitude_m = 400\ndynamics = "autopilot"', "altitude_m", "at most 300"),
     "far away": ("[-121.92, 121.92]", "[-1e300, 121.92]", "vehicle 2: offset_ne_m[0]", "-1000000"),
     "faster than anything": ("[91.44, 0.0]", "[1e5, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "10000"),
     "a delay of years": ("up = { delay_s = 0.02 }", "up = { delay_s = 1e9 }", "links.up.delay_s", "1000000"),
@@ -286,5 +284,15 @@ def test_every_copter_must_have_an_altitude_to_take_off_to() -> None:
         return checked(copters.model_copy(update={"altitude_m": altitude_m, "vehicles": vehicles}), FILE)
 
     assert flown_at(0.0, 20.0).altitude_m == 0.0  # no vehicle flies at it
-    with pytest.raises(ScenarioError, match=r"vehicles\[0\]\.altitude_m: read 0, wanted an altitude above 0"):
+    with pytest.raises(ScenarioError, match=r"vehicles\[0\]\.altitude_m: read 0.0, wanted an altitude above 0"):
         flown_at(20.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("line", "read", "wanted"),
+    [("", "no such key", "an altitude above 0 to take off to"), ("altitude_m = 400.0", "400.0", "at most 300, which")],
+)
+def test_copters_take_off_to_an_altitude_that_they_are_given_and_reach(line: str, read: str, wanted: str) -> None:
+    text = (SCENARIOS / "copters5.toml").read_text()
+    with pytest.raises(ScenarioError, match=f"altitude_m: read {read}, wanted {wanted}"):
+        parse(text.replace("altitude_m = 20.0", line, 1), FILE)
