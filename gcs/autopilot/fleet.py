@@ -119,11 +119,11 @@ class AutopilotFleet(Fleet):
                 continue
             self._located.add(row)
             north, east = between(first.origin, startup.origin)
-            known_north, known_east, _ = self.frame_ned_m[row].tolist()
-            if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:
+            known_ned_m: list[float] = self.frame_ned_m[row].tolist()
+            if hypot(north - known_ned_m[0], east - known_ned_m[1]) > _FRAME_RESOLUTION_M:
                 history.forget(row)
             else:
-                north, east = known_north, known_east
+                north, east, _ = known_ned_m
             self.frame_ned_m[row] = north, east, first.origin_altitude_m - startup.origin_altitude_m
 
     def identify(self, due_ns: int, history: StateHistory) -> str:
