@@ -115,5 +115,9 @@ def in_sequence(ticks: Sequence[TickArray]) -> TickArray:
 
 
 def chosen(rows: TickArray, which: NDArray[Any]) -> TickArray:
-    """Records selected by a mask or by indices, also copied as bytes."""
+    """Records selected by a mask or by indices: a view if they are equally spaced, else copied as bytes."""
+    places = which.nonzero()[0] if which.dtype == bool else which
+    steps = np.diff(places)
+    if steps.size and steps[0] > 0 and (steps == steps[0]).all():
+        return rows[places[0] : places[-1] + 1 : steps[0]]
     return np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize)))[which].view(rows.dtype)

@@ -25,12 +25,13 @@ from sim_vehicles.vehicles.plain import step_all
 if TYPE_CHECKING:
     from scenarios.handle import Handle
 
+_NOT_YET = -1
 NOT_LEFT, PAUSED = -1, -2
 """Progress of a call, in addition to the codes of `usual_step`. NOT_LEFT: Python must finish the vehicles' part of the
 step. PAUSED: the steps are complete, but Python must take the rows and datagrams."""
 _STEPS = 4
 """Number of steps whose datagrams the buffers hold."""
-_FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 32, 1024
+_FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 128, 1024
 """Ticks flown in one call when nothing needs them one at a time: initially few, because Python is soon needed again,
 doubling up to the maximum; and the maximum number of rows."""
 _WIRE = np.dtype(
@@ -56,6 +57,8 @@ class Wire(NamedTuple):
     sent: Bytes
     to: Ints
     """The table of the sent datagrams."""
+    none_queued: Ints
+    """Zeros: no datagram has waited in a socket buffer."""
     due: Records
     """Records of DUE for the next ticks."""
     rows: Records
@@ -93,15 +96,15 @@ class UsualSteps:
     ) -> None:
         self._station, self._fleet, self._addresses, self._places = station, fleet, addresses, places
         most, n = _STEPS * fleet.most_leaving, len(places)
-        self._none_queued = np.zeros(most, np.int64)
         self._room, self._ahead = most - fleet.most_leaving, ahead
         arrived, sent = np.zeros((2, most * FRAME_BYTES), np.uint8)
         arrivals, to = np.zeros((2, 4, most), np.int64)
         ticks = max(1, min(_MOST_TICKS, _MOST_ROWS // n)) if ahead else 1
         self._wire = Wire(
-            np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(ticks, DUE), np.empty(ticks * n, TICK)
-        )
-        self._state, self._due, self._most_ticks = Columns(self._wire.state), Columns(self._wire.due), ticks
+            np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(most, np.int64), np.zeros(ticks, DUE),
+            np.empty(ticks * n, TICK),
+        )  # fmt: skip
+        self._state, self._most_ticks = Columns(self._wire.state), ticks
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
         self._tick_bytes = n * TICK.itemsize
         self._handle: Handle | None = None
@@ -119,49 +122,56 @@ class UsualSteps:
             return Stopped(now_ns, self._fleet.step(entering, now_ns), 0)
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
-        ends = Ends(self._fleet.arrays, station.usual, self._places, station.senders(self._addresses), wire)
-        if self._handle is None or not _same(ends, self._handle.kept):
-            self._handle = handle(ends)
-        arrived, ticks, most = state["arrived"], state["ticks"], min(_FIRST_TICKS, self._most_ticks)
+        usual, senders = station.usual, station.senders(self._addresses)
+        arrived, ticks, most, left = state["arrived"], state["ticks"], min(_FIRST_TICKS, self._most_ticks), _NOT_YET
         while True:
             self._fleet.make_ready()
-            how_far = _fly(self._handle, station.look_ahead(self._due, most), self._room, self._ahead)
-            most = min(2 * most, self._most_ticks)
+            ends = Ends(self._fleet.arrays, usual, self._places, senders, wire)
+            if self._handle is None or not _same(ends, self._handle.kept):
+                self._handle = handle(ends)
+            how_far = _fly(self._handle, station.look_ahead(wire.due, most), self._room, self._ahead, left)
+            most, left = min(2 * most, self._most_ticks), _NOT_YET
             if how_far in (PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
             if ticks[0]:
                 yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
             if how_far == NOT_JUDGED:
                 nobody = np.zeros(len(self._places), np.int64)
-                tick = station.unjudged(self._due["time_s"][ticks[0]], state["now_ns"][0], nobody)
+                tick = station.unjudged(wire.due["time_s"].item(ticks[0]), state["now_ns"][0], nobody)
                 yield station.complete(tick, [tick.due_ns])
-            if how_far not in (PAUSED, NOT_JUDGED):
-                return self._stopped(how_far, state["now_ns"][0])
+            if how_far == NOT_LEFT:
+                left = self._leave()
+                if not self._fleet.all_left(left):
+                    self._pass_on(arrived[0])
+                    return Stopped(state["now_ns"][0], self._fleet.left(left, state["now_ns"][0]), 0)
+            elif how_far not in (PAUSED, NOT_JUDGED):
+                return self._not_taken(state["now_ns"][0])
             if ticks[0] or how_far == NOT_JUDGED:
                 station.frames.clear()
 
     def _pass_on(self, count: int) -> None:
-        """Add the first `count` arrived datagrams to the station's frames, and empty the buffer of arrivals."""
-        if count:
-            self._station.frames.add(Arrivals(*self._arrived(0, count), self._none_queued, self._addresses))
+        """Add the first `count` arrived datagrams to the station's frames, if wanted, and empty their buffer."""
+        if count and not self._ahead:
+            self._station.frames.add(Arrivals(*self._arrived(0, count), self._wire.none_queued, self._addresses))
         self._state["arrived"][0] = self._state["arrived_bytes"][0] = 0
 
     def _arrived(self, first: int, stop: int) -> tuple[Bytes, Ints]:
         size = self._state["arrived_bytes"][0]
         return self._wire.arrived[:size].copy(), self._wire.arrivals[:, first:stop].copy()
 
-    def _stopped(self, how_far: int, now_ns: int) -> Stopped:
+    def _leave(self) -> int:
+        """Finish the vehicles' part of the last step; returns how many datagrams leave the links."""
         state = self._state
-        ids, count, in_step = self._fleet.system_ids, state["arrived"][0], state["in_step"][0]
-        if how_far == NOT_LEFT:
-            self._pass_on(count)
-            stream, table = self._wire.sent[: state["sent_bytes"][0]], self._wire.to[:, : state["sent"][0]]
-            entered, waiting, leaving = (state[name][0] for name in ("entered", "waiting", "leaving"))
-            entering = Datagrams(stream, table.copy(), ids)
-            return Stopped(now_ns, self._fleet.go_on(entering, entered, waiting, leaving, now_ns), 0)
-        arrived = Datagrams(*self._arrived(count - in_step, count), ids)
+        stream, table = self._wire.sent[: state["sent_bytes"][0]], self._wire.to[:, : state["sent"][0]]
+        entering = Datagrams(stream, table.copy(), self._fleet.system_ids)
+        entered, waiting, leaving, now_ns = (state[name][0] for name in ("entered", "waiting", "leaving", "now_ns"))
+        return self._fleet.go_on(entering, entered, waiting, leaving, now_ns)
+
+    def _not_taken(self, now_ns: int) -> Stopped:
+        count, in_step = self._state["arrived"][0], self._state["in_step"][0]
+        arrived = Datagrams(*self._arrived(count - in_step, count), self._fleet.system_ids)
         self._pass_on(count - in_step)
-        return Stopped(now_ns, arrived, state["taken"][0])
+        return Stopped(now_ns, arrived, self._state["taken"][0])
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -170,22 +180,23 @@ def _same(one: Any, other: Any) -> bool:
 
 
 @array_kernel
-def _fly(ends: Any, known: int, room: int, ahead: bool) -> int:
+def _fly(ends: Any, known: int, room: int, ahead: bool, left: int) -> int:
     """Do steps while they are usual, up to the last of the `known` ticks; returns the code of the progress made.
 
     `ends` is a handle on `Ends`. While at most `room` datagrams have arrived, those of one more step fit into the
-    buffer; with `ahead`, those of earlier steps are discarded.
+    buffer; with `ahead`, those of earlier steps are discarded. The vehicles' part of the first step is done if `left`,
+    the number of datagrams that leave in it, is not _NOT_YET.
     """
     wire = ends.arrays[-1]
     state = wire.state[0]
     state.ticks = 0
     while True:
-        if state.arrived > room:
+        if left == _NOT_YET and state.arrived > room:
             if not ahead:
                 return PAUSED
             state.arrived = state.arrived_bytes = 0
         state.now_ns = state.next_ns
-        how_far = _step(ends, known)
+        how_far, left = _step(ends, known, left), _NOT_YET
         if how_far == WITH_TICK:
             state.ticks += 1
             if state.ticks == known:
@@ -195,25 +206,27 @@ def _fly(ends: Any, known: int, room: int, ahead: bool) -> int:
 
 
 @array_kernel
-def _step(ends: Any, known: int) -> int:
-    """Do one step as far as it is usual; returns the code of the progress made."""
+def _step(ends: Any, known: int, leaving: int) -> int:
+    """Do one step as far as it is usual; returns the code of the progress made. For `leaving` see `left` of `_fly`."""
     fleet, usual, places, senders, wire = ends.arrays
     state, n = wire.state[0], len(places)
     now_ns, ticks = state.now_ns, state.ticks
-    entered, waiting, leaving = step_all(
-        fleet.vehicles, fleet.links, fleet.entries, fleet.frames, fleet.draws, fleet.truth,
-        wire.sent[: state.sent_bytes], wire.to[:, : state.sent].copy(),
-        fleet.waiting, fleet.leaving, fleet.leaving_data, 0, now_ns,
-    )  # fmt: skip
-    if entered < state.sent or waiting or leaving == fleet.leaving.shape[1] or not can_record(fleet.truth):
-        state.entered, state.waiting, state.leaving = entered, waiting, leaving
-        return NOT_LEFT
+    if leaving == _NOT_YET:
+        entered, waiting, leaving = step_all(
+            fleet.vehicles, fleet.links, fleet.entries, fleet.frames, fleet.draws, fleet.truth,
+            wire.sent[: state.sent_bytes], wire.to[:, : state.sent].copy(),
+            fleet.waiting, fleet.leaving, fleet.leaving_data, 0, now_ns,
+        )  # fmt: skip
+        if entered < state.sent or waiting or leaving == fleet.leaving.shape[1] or not can_record(fleet.truth):
+            state.entered, state.waiting, state.leaving = entered, waiting, leaving
+            return NOT_LEFT
     usual.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
-    queued_ns, due = np.zeros(leaving, np.int64), wire.due[min(ticks, len(wire.due) - 1)]
+    due = wire.due[min(ticks, len(wire.due) - 1)]
     how_far, state.taken, first, second, third = usual_step(
-        usual, wire.arrived, table, queued_ns, senders, due, ticks < known, wire.rows[ticks * n : (ticks + 1) * n]
-    )
+        usual, wire.arrived, table, wire.none_queued[:leaving], senders, due, ticks < known,
+        wire.rows[ticks * n : (ticks + 1) * n],
+    )  # fmt: skip
     state.sent = state.sent_bytes = 0
     _send(wire, first, places, now_ns)
     _send(wire, second, places, now_ns)

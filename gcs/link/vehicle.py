@@ -325,7 +325,8 @@ class RemoteVehicle:
         waiting = self._command
         if self.address is None:
             return inf
-        if waiting is None and not self.idle and (self.goal is Goal.FLY or self._wanted() is not None):
+        works = not self.idle and not self.awaits_clock
+        if waiting is None and works and (self.goal is Goal.FLY or self._wanted() is not None):
             return 0
         return min(inf if waiting is None else waiting.sent_ns + NS_PER_S, self.heard_ns + _SILENT_NS)
 
@@ -333,6 +334,13 @@ class RemoteVehicle:
     def has_to_speak(self) -> bool:
         """Whether it cannot become ready before it sends something unusual."""
         return not self.left_out and (self.address is None or self._next_step().command is not None)
+
+    @property
+    def awaits_clock(self) -> bool:
+        """Whether it lacks only answers to TIMESYNC, so is sent nothing else until it has them: it has no autopilot."""
+        if self.clock.samples >= LEAST_SAMPLES or self.kind.piloted or self.left_out or self.goal is not Goal.FLY:
+            return False
+        return self.guided and self._next_step().command is None
 
     @property
     def ready(self) -> bool:

@@ -131,8 +131,8 @@ def by_vehicle(rows: Rows) -> defaultdict[int, Rows]:
     """Rows grouped by system id, in their original order; any other id gives an empty array."""
     order = rows["system_id"].argsort(kind="stable")
     system_ids, first = np.unique(rows["system_id"][order], return_index=True)
-    found = zip(system_ids.tolist(), np.split(chosen(rows, order), first[1:]), strict=False)
-    return defaultdict(lambda: rows[:0], found)
+    found = zip(system_ids.tolist(), np.split(order, first[1:]), strict=False)
+    return defaultdict(lambda: rows[:0], {system_id: chosen(rows, own) for system_id, own in found})
 
 
 class RunTail:

@@ -1,5 +1,7 @@
 """The journal of a flight: its events, and the reason why it is to end. All parts of a station write to it."""
 
+from typing import Any
+
 from gcs.control.tick import Event
 from scenarios.schema import NS_PER_S
 
@@ -20,8 +22,8 @@ class Journal:
         """When the formation flight began."""
         self._start_ns, self._patience_s = start_ns, patience_s
 
-    def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that, the time since the start minus the patience: negative."""
+    def scenario_time_s(self, now_ns: Any) -> Any:
+        """Time since the flight began; before that, time since the start minus the patience: negative. Takes arrays."""
         if self.flight_start_ns is None:
             return (now_ns - self._start_ns) / NS_PER_S - self._patience_s
         return (now_ns - self.flight_start_ns) / NS_PER_S

@@ -233,7 +233,7 @@ class FormationMonitor:
 
     def _rows(self, modes: tuple[Mode, ...]) -> list[int]:
         """The rows of the vehicles in any of these modes."""
-        return np.isin(self.modes, modes).nonzero()[0].tolist()
+        return [row for row, mode in enumerate(self.modes.tolist()) if mode in modes]
 
     def blends(self, time_s: float) -> Records:
         """The gains (n, BLEND) with which each vehicle is flown."""
@@ -265,6 +265,8 @@ class FormationMonitor:
 
         A CRITICAL vehicle whose headroom is unknown does not open it: its loop may be well, and its gains are slow.
         """
+        if not self._troubled and self.opening == 1.0:
+            return
         slowest = self.margins_s.shape[1] - 1
         settled_s = time_s - self.policy.blend_s  # gives the slowest gains time to take effect
         changed_s = self._states["changed_s"]

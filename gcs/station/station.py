@@ -116,7 +116,6 @@ class Station:
             self._schedule[name] = value
         self._used_s, self._repeated_ns = np.full(n, nan), np.zeros((2, n), np.int64)
         self._scratch, self._due = new_scratch(n), np.zeros(1, DUE)
-        self._due_columns = Columns(self._due)
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
@@ -186,26 +185,32 @@ class Station:
         """Whether steps may take the fast path of `gcs.station.usual`."""
         return self._fleet.is_usual and self._tolerated is not None
 
-    def look_ahead(self, ticks: Columns, most: int) -> int:
-        """Fill in, for up to `most` ticks ahead, the data that usual steps need; `ticks` are the columns of DUE.
+    def look_ahead(self, ticks: Records, most: int) -> int:
+        """Fill in, for up to `most` ticks ahead, the data that usual steps need; `ticks` are records of DUE.
 
         Returns the number of ticks that may be usual. A step in Python in between invalidates the rest.
         """
-        scenario, next_ns, flying = self.plan.scenario, self.next_tick_ns, self.phase is Phase.FLYING
+        next_ns, flying = self.next_tick_ns, self.phase is Phase.FLYING
         waiting = self._reception.touched or self._gone or self._returning
         if waiting or not self._monitor.is_calm(self.scenario_time_s(next_ns), flying=flying):
             return 0
         if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
             return 0
         quiet_until_ns, longest_s = inf if flying else self._quiet_until_ns(), self._longest_phase_s
-        flies, times_s, north_m_s, east_m_s = (ticks[name] for name in DUE.names or ())
-        for place in range(most):
+
+        def may_be_usual(place: int) -> bool:
             due_ns = next_ns + place * self._period_ns
-            if due_ns >= quiet_until_ns or self._waited_s(due_ns) >= longest_s:
-                return place
-            flies[place], times_s[place] = flying, self.scenario_time_s(due_ns)
-            north_m_s[place], east_m_s[place] = scenario.nominal_velocity_at(times_s[place])
-        return most
+            return due_ns < quiet_until_ns and self._waited_s(due_ns) < longest_s
+
+        count = most if may_be_usual(most - 1) else sum(map(may_be_usual, range(most)))
+        if not count:
+            return 0
+        times_s, scenario = self.scenario_time_s(next_ns + self._period_ns * np.arange(count)), self.plan.scenario
+        steady = len(scenario.nominal_velocity) == 1 and not scenario.course.is_smooth
+        velocities = [scenario.nominal_velocity_at(time_s) for time_s in times_s[: 1 if steady else count].tolist()]
+        ticks["flying"][:count], ticks["clock_row"][:count] = flying, -1 if flying else self._awaited_clock
+        ticks["time_s"][:count], ticks["velocity_ne_m_s"][:count] = times_s, velocities
+        return count
 
     def _quiet_until_ns(self) -> float:
         """The time before which ticks outside the flight have nothing to do unless a vehicle sends something unusual.
@@ -218,8 +223,13 @@ class Station:
             waits = not self._all_ended
         else:
             connects = self.phase is Phase.CONNECTING and not self._journal.stop
-            waits = connects and any(vehicle.has_to_speak for vehicle in self.vehicles)
+            waits = connects and (self._awaited_clock >= 0 or any(vehicle.has_to_speak for vehicle in self.vehicles))
         return min(vehicle.quiet_until_ns for vehicle in self.vehicles) if waits else 0
+
+    @property
+    def _awaited_clock(self) -> int:
+        """The row of a vehicle that only `awaits_clock`; -1 if there is none."""
+        return next((row for row, vehicle in enumerate(self.vehicles) if vehicle.awaits_clock), -1)
 
     def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
         """A tick whose set-points kernels have made; the arguments are fields of `Tick`."""
@@ -297,14 +307,14 @@ class Station:
 
     def _usual_tick(self, outgoing: Outbox) -> Tick | None:
         """Do the tick due now with a kernel if possible, else return None."""
-        due_ns, due = self.next_tick_ns, self._due_columns
-        if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(due, 1):
+        due_ns = self.next_tick_ns
+        if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(self._due, 1):
             return None
         done, set_points = usual_set_points(self.usual, self._due)
         if not done:
             return None
         indices = self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing)
-        return self.unjudged(due["time_s"][0], due_ns, indices)
+        return self.unjudged(self._due["time_s"].item(), due_ns, indices)
 
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns

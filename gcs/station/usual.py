@@ -18,6 +18,7 @@ from gcs.control.law import CONTROL, FeedbackLaw, control_all, nearest
 from gcs.control.limits import LARGEST_COMMAND_M_S2, any_beyond, shorten
 from gcs.control.loop_delay import longest_repetition_ns, repeated_s
 from gcs.control.loops import accelerations
+from gcs.link.clocks import LEAST_SAMPLES
 from gcs.link.mavlink import (
     HEARTBEAT_EXTRA,
     SET_POINT,
@@ -75,6 +76,14 @@ def limits_of(plan: FlightPlan) -> TickLimits:
     )  # fmt: skip
 
 
+class Sending(NamedTuple):
+    """Frames to vehicles: frame k is the first `sizes[k]` bytes of `frames[k]` and goes to the vehicle `rows[k]`."""
+
+    frames: Bytes
+    sizes: Ints
+    rows: Ints
+
+
 class Scratch(NamedTuple):
     """Buffers for the results of a usual tick for n vehicles."""
 
@@ -84,10 +93,13 @@ class Scratch(NamedTuple):
     """Of `gcs.link.mavlink.SET_POINT`."""
     rtt_s: FloatArray
     silent: NDArray[np.bool_]
+    nothing: Sending
+    """No frames."""
 
 
 def new_scratch(n: int) -> Scratch:
-    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_))
+    nothing = Sending(np.empty((0, 0), np.uint8), np.empty(0, np.int64), np.empty(0, np.int64))
+    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_), nothing)
 
 
 class Usual(NamedTuple):
@@ -113,16 +125,9 @@ class Usual(NamedTuple):
     scratch: Scratch
 
 
-DUE = np.dtype([("flying", "?"), ("time_s", "f8"), ("north_m_s", "f8"), ("east_m_s", "f8")], align=True)
-"""Data of a future tick from Python: whether the formation is flown, its scenario time, its nominal velocity."""
-
-
-class Sending(NamedTuple):
-    """Frames to vehicles: frame k is the first `sizes[k]` bytes of `frames[k]` and goes to the vehicle `rows[k]`."""
-
-    frames: Bytes
-    sizes: Ints
-    rows: Ints
+DUE = np.dtype([("flying", "?"), ("clock_row", "i8"), ("time_s", "f8"), ("velocity_ne_m_s", "f8", (2,))], align=True)
+"""Data of a future tick from Python: whether the formation is flown, its scenario time, its nominal velocity. Python
+does the tick if the clock of the vehicle in `clock_row` has become known; -1 for none."""
 
 
 @array_kernel
@@ -136,7 +141,7 @@ def usual_step(
     to do that tick. `rows` receives the rows of the tick.
     """
     schedule, tables = usual.schedule[0], usual.tables
-    nothing, taken = _nothing(), 0
+    nothing, taken = usual.scratch.nothing, 0
     if NEWS_OF_A_FRAME * table.shape[1] > len(tables.news):
         return NOT_TAKEN, taken, nothing, nothing, nothing
     now = Now(schedule.now_ns, schedule.start_ns, schedule.period_ns, False)
@@ -149,10 +154,10 @@ def usual_step(
     if schedule.now_ns >= schedule.next_tick_ns:
         if not known or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due):
             return NOT_DONE, taken, nothing, nothing, nothing
-        answers = _answered(tables)
+        answers = _answered(tables, nothing)
         set_points, judged = _tick(usual, due, rows)
         return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
-    answers = _answered(tables)
+    answers = _answered(tables, nothing)
     heartbeats = requests = nothing
     links = tables.links
     if schedule.now_ns >= schedule.next_heartbeat_ns:
@@ -167,9 +172,11 @@ def usual_step(
 
 
 @array_kernel
-def _answered(tables: Tables) -> Sending:
+def _answered(tables: Tables, nothing: Sending) -> Sending:
     """Answers to the vehicles' requests, which are the only news."""
     count = tables.news_count[0]
+    if not count:
+        return nothing
     frames, sizes, rows = (
         np.zeros((count, TIMESYNC_FRAME_BYTES), np.uint8),
         np.empty(count, np.int64),
@@ -182,11 +189,6 @@ def _answered(tables: Tables) -> Sending:
         sizes[place], rows[place] = encode_timesync(frames[place], news.value_ns, news.sent_ns, link.sequence), news.row
     tables.news_count[0] = 0
     return Sending(frames, sizes, rows)
-
-
-@array_kernel
-def _nothing() -> Sending:
-    return Sending(np.empty((0, 0), np.uint8), np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 @array_kernel
@@ -205,6 +207,8 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 def _is_calm(usual: Usual, due: Record) -> bool:
     """Whether the monitor only has to record delays and times; if so, it records them."""
     limits, silent, judged = usual.limits, usual.scratch.silent, usual.watched.judged[0]
+    if due.clock_row >= 0 and usual.tables.clocks[due.clock_row].samples >= LEAST_SAMPLES:
+        return False
     for row in range(len(silent)):
         silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
     seen = Seen(due.time_s, due.flying, silent, usual.guided, usual.critical, usual.used_s)
@@ -219,7 +223,7 @@ def _is_calm(usual: Usual, due: Record) -> bool:
 def usual_set_points(usual: Usual, due: Records) -> tuple[bool, Sending]:
     """Make the set-points of the tick due now, DUE (1,). If it is not usual, nothing is done and False is returned."""
     if not _is_calm(usual, due[0]):
-        return False, _nothing()
+        return False, usual.scratch.nothing
     set_points, _ = _command(usual, due[0])
     return True, set_points
 
@@ -234,7 +238,8 @@ def _command(usual: Usual, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
     schedule.tick_count += ticks
     times_ns, states = every_newest(tables.reports, tables.report_counts)
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
-    control_all(controls, law, times_ns, states, seen, usual.blends, due.north_m_s, due.east_m_s, 1.0)
+    north_m_s, east_m_s = due.velocity_ne_m_s
+    control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
     followed = commanded(controls, usual.watched.states.released, due.flying)
     accelerations(points, controls, followed)

@@ -131,11 +131,13 @@ def effective_delays_s(
     """For each vehicle, the constant loop delay equivalent to those of its commands in these rows."""
     truth = flight.truth
     assert truth is not None
-    whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
     on_board, held_s = plan.scenario.control.loop == "onboard", plan.timing.held_s
 
     def commands(system_id: int) -> IntArray:
-        return commands_on_board(whole, truth, system_id) if on_board else commands_of(rows, truth, system_id)
+        if not on_board:
+            return commands_of(rows, truth, system_id)
+        whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
+        return commands_on_board(whole, truth, system_id)
 
     return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 

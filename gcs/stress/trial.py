@@ -149,7 +149,7 @@ def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
         lateness_s_p99=lateness_s.p99,
         steal_share=flight.steal_share,
         busy_share=flight.busy_share,
-        ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.tobytes()).hexdigest(),
+        ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.view(np.uint8).data).hexdigest(),
         trace_m=_trace(flight.ticks),
     )
 

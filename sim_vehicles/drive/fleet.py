@@ -196,12 +196,13 @@ class Fleet:
             received = ()
         entering = received if isinstance(received, Datagrams) else datagrams_of(received, self._rows)
         begun = step_all(*self._arrays(), entering.stream, entering.table, *self._edge, 0, now_ns)
-        return self.go_on(entering, *begun, now_ns)
+        return self.left(self.go_on(entering, *begun, now_ns), now_ns)
 
-    def go_on(
-        self, entering: Datagrams, entered: int, waiting: int, leaving: int, now_ns: int
-    ) -> Datagrams | list[Datagram]:
-        """Finish a step begun by `step_all`, which returned the three numbers."""
+    def go_on(self, entering: Datagrams, entered: int, waiting: int, leaving: int, now_ns: int) -> int:
+        """Continue a step begun by `step_all`, which returned the three numbers; returns how many datagrams have left.
+
+        They are in `arrays`. More may leave, see `all_left` and `left`.
+        """
         while entered < len(entering):
             begin, end, row, time_ns = entering.table[:, entered].tolist()
             self._in_rows[row].down.send(entering.stream[begin:end].tobytes(), time_ns)
@@ -210,12 +211,20 @@ class Fleet:
         if waiting:
             self._run_waiting(waiting, now_ns)
             leaving = self._leave(now_ns)
-        left = self._left(leaving)
-        if leaving < self._leaving.shape[1] and (self._recorder is None or can_record(self._recorder.rows)):
+        return leaving
+
+    def all_left(self, count: int) -> bool:
+        """Whether the `count` datagrams that have left in `go_on` are all that leave by its time."""
+        return count < self.most_leaving and (self._recorder is None or can_record(self._recorder.rows))
+
+    def left(self, count: int, now_ns: int) -> Datagrams | list[Datagram]:
+        """The `count` datagrams that have left in `go_on`, and all others that leave by its time, in order of time."""
+        left = self._left(count)
+        if self.all_left(count):
             return left
         out = [*left]
-        while leaving := self._leave(now_ns):
-            out += self._left(leaving)
+        while count := self._leave(now_ns):
+            out += self._left(count)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
 

@@ -16,7 +16,7 @@ from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
 
 MOST_FLIPS = 4
-BLOCK, BLOCKS = 128, 2
+BLOCK, BLOCKS = 256, 2
 """Draws are made for BLOCK datagrams at once, because numpy takes as long for one as for a hundred. BLOCKS such blocks
 form a ring buffer: one is refilled while part of the other is left."""
 
@@ -85,21 +85,23 @@ def flip(data: NDArray[np.uint8], size: int, flips: NDArray[np.float64], count: 
 
 
 class Stream:
-    """The draws of one link, a block at a time."""
+    """The draws of one link, a block at a time. A link that never loses or changes datagrams needs only the jitter."""
 
     def __init__(self, link: link_keys.Link, seeds: np.random.SeedSequence) -> None:
         self._fates, self._delays = map(np.random.default_rng, seeds.spawn(2))
         self._jitter = link.jitter
+        self._only_delays = constant(link.model_copy(update={"jitter": None}))
         if link.jitter is not None and link.jitter.distribution == "trace":
             self._trace_s = np.array(link.jitter.trace_s or (0.0,))
             self._at = int(self._delays.integers(len(self._trace_s)))
 
     def fill(self, block: Records) -> None:
         """Fill a block of `DRAW` with the next draws."""
-        uniform = self._fates.random((BLOCK, 4 + MOST_FLIPS))
-        for k, name in enumerate(("burst", "loss", "duplicate", "corrupt")):
-            block[name] = uniform[:, k]
-        block["flips"] = uniform[:, 4:]
+        if not self._only_delays:
+            uniform = self._fates.random((BLOCK, 4 + MOST_FLIPS))
+            for k, name in enumerate(("burst", "loss", "duplicate", "corrupt")):
+                block[name] = uniform[:, k]
+            block["flips"] = uniform[:, 4:]
         if self._jitter is not None:
             delays_ns = np.rint(self._delays_s(self._jitter) * NS_PER_S)
             block["jitter_ns"], block["duplicate_jitter_ns"] = delays_ns.T

@@ -86,6 +86,7 @@ def ends_in_failsafe() -> Scenario:
 FLIGHTS = {
     "calm": changed("triangle5"),
     "coupled": changed("chain3_bidirectional"),
+    "jitter": changed("triangle5", link={"jitter": Jitter(distribution="uniform", scale_s=0.01)}),
     "wild links": changed("triangle5", link=WILD),
     "slow telemetry": changed("triangle5", rates=Rates(control_hz=50.0, telemetry_hz=12.5)),
     "limits": changed("triangle5_scattered", limits=Limits(acceleration_max_m_s2=0.5)),
@@ -111,6 +112,8 @@ def test_kernels_alone_and_python_fly_the_same_flight(name: str) -> None:
     assert (station.counters, station.end_reason) == (other.counters, other.end_reason)
     if name == "calm":
         assert station.steps < 0.1 * other.steps
+    if name == "jitter":  # a step for each unusual frame to the station, and for the tick after it; none to vehicles
+        assert station.steps < 45
     if name in {"breaks", "turns round"}:
         assert station.steps < 0.2 * other.steps
 

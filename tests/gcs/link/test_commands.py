@@ -1,7 +1,8 @@
 """Commands and their answers, which do not say what they answer."""
 
 from gcs.link import mavlink
-from gcs.link.kinds import SET_MESSAGE_INTERVAL, Goal
+from gcs.link.clocks import LEAST_SAMPLES
+from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, Goal
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle, in_words
 from scenarios.schema import NS_PER_S
@@ -53,6 +54,21 @@ def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
         vehicle.heard_ns = k * NS_PER_S
         assert requested(vehicle.next_frame(k * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
     assert "telemetry rate" in vehicle.missing
+
+
+def test_a_vehicle_with_nothing_left_to_command_awaits_answers_to_timesync() -> None:
+    vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
+    vehicle.address, vehicle.heard_ns = ("127.0.0.1", 1, 0), NS_PER_S
+    for command in (SET_MESSAGE_INTERVAL, SET_MODE, ARM_DISARM):
+        assert not vehicle.awaits_clock
+        assert vehicle.next_frame(NS_PER_S) is not None
+        vehicle.acknowledge((command, 0, 0, 0, 0, 0), NS_PER_S)
+    assert vehicle.awaits_clock
+    assert vehicle.next_frame(NS_PER_S) is None
+    assert vehicle.quiet_until_ns > NS_PER_S
+    vehicle.clock.samples = LEAST_SAMPLES
+    assert not vehicle.awaits_clock
+    assert vehicle.ready
 
 
 def stranger() -> tuple[RemoteVehicle, list[int]]:

@@ -15,6 +15,7 @@ from scipy import stats
 
 from scenarios.keys import link as link_keys
 from scenarios.keys.link import Jitter, LossBursts
+from sim_vehicles.links.fate import BLOCK, DRAW, Stream
 from sim_vehicles.links.links import Link, LinkSet
 from sim_vehicles.links.queue import new_queues
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, MemoryRecorder
@@ -180,3 +181,15 @@ def test_an_added_effect_leaves_the_other_draws(change: dict[str, float]) -> Non
     common = before.keys() & after.keys()
     assert len(common) > 80
     assert all(before[number] == after[number] for number in common)
+
+
+def test_a_link_with_jitter_alone_draws_only_that_and_the_same_as_with_loss() -> None:
+    with_loss = link_keys.Link(jitter=Jitter(distribution="gamma", scale_s=0.01, shape=2.5), loss_probability=0.1)
+    drawn: list[Any] = []
+    for link in (with_loss, with_loss.model_copy(update={"loss_probability": 0.0})):
+        stream, block = Stream(link, np.random.SeedSequence(3)), np.zeros(BLOCK, DRAW)
+        stream.fill(block)
+        drawn.append(block)
+    assert drawn[0]["loss"].all()
+    assert not drawn[1]["loss"].any()
+    assert drawn[1]["jitter_ns"].tolist() == drawn[0]["jitter_ns"].tolist()
