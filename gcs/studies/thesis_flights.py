@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import scenarios
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.requirement import Requirement
 from gains.design.design import design
 from gains.formation.model import FormationModel
@@ -94,26 +94,26 @@ def fly_with_late_neighbours(
 ) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and errors e (k, states) of the source's nonlinear model with delayed data from neighbours, (5.1).
 
-    X' = V cos ψ, Y' = V sin ψ, ψ' = ω, V' = a with (a, ω) = M(ξ) u, (2.2)-(2.6), integrated by RK4 with M in every
-    stage; u_i(t) = K_ii x_i(t) + sum of K_ij x_j(t − h), held for one step of 1 ms. Before t = 0 the errors are
-    constant at `start` (states,); the formation heads north. The model shares no code with the simulated vehicles.
+    X' = V cos ψ, Y' = V sin ψ, ψ' = ω, V' = a with (a, ω) = M(ξ) u, (2.2)-(2.6): with north + j east as one number and
+    w = ln V + jψ, z' = e^w and w' = u e^-w, integrated by RK4. u_i(t) = K_ii x_i(t) + sum of K_ij x_j(t − h), held for
+    one step of 1 ms. Before t = 0 the errors are constant at `start` (states,); the formation heads north. The model
+    shares no code with the simulated vehicles.
     """
     steps, lag = round(duration_s / STEP_S), round(delay_s / STEP_S)
     own = own_part(CHAIN, K)
     others = K - own
-    north_m, east_m, v_north, v_east = _IN_PLACE.states(start).T
-    state = np.stack([north_m, east_m, np.arctan2(v_east, v_north), np.hypot(v_north, v_east)], axis=1)
+    z, velocity = _IN_PLACE.states(start).view(np.complex128).T
+    state = np.stack([z, np.log(velocity)])
     errors = np.empty((steps + 1, CHAIN.states))
     errors[0] = start
     for k in range(steps):
         u = own @ errors[k] + others @ errors[max(0, k - lag)]
-        state = _rk4(state, u.reshape(-1, 2))
-        heading, speed = state[:, 2:3], state[:, 3:]
-        errors[k + 1] = _IN_PLACE.errors(np.hstack([state[:, :2], speed * np.cos(heading), speed * np.sin(heading)]))
+        state = _rk4(state, u.view(np.complex128))
+        errors[k + 1] = _IN_PLACE.errors(np.stack([state[0], np.exp(state[1])], axis=1).view(np.float64))
     return np.arange(steps + 1, dtype=np.float64) * STEP_S, errors
 
 
-def _rk4(state: FloatArray, u: FloatArray) -> FloatArray:
+def _rk4(state: ComplexArray, u: ComplexArray) -> ComplexArray:
     k1 = _rates(state, u)
     k2 = _rates(state + 0.5 * STEP_S * k1, u)
     k3 = _rates(state + 0.5 * STEP_S * k2, u)
@@ -121,10 +121,9 @@ def _rk4(state: FloatArray, u: FloatArray) -> FloatArray:
     return state + STEP_S / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-def _rates(state: FloatArray, u: FloatArray) -> FloatArray:
-    cosine, sine, speed = np.cos(state[:, 2]), np.sin(state[:, 2]), state[:, 3]
-    along, across = cosine * u[:, 0] + sine * u[:, 1], cosine * u[:, 1] - sine * u[:, 0]
-    return np.stack([speed * cosine, speed * sine, across / speed, along], axis=1)
+def _rates(state: ComplexArray, u: ComplexArray) -> ComplexArray:
+    velocity = np.exp(state[1])
+    return np.array([velocity, u / velocity])
 
 
 def formation_figure(file: Path, method: str) -> Path:
