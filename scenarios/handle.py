@@ -43,7 +43,7 @@ def handle(arrays: Any) -> Handle:
 
 @array_kernel
 def _handle(arrays: Any) -> Any:
-    """The compiled code cached on disk names the tuples' classes: when one is renamed, this file has to change, too."""
+    """The compiled code cached on disk names the tuples' classes. If one is renamed, this file has to change, too."""
     return Handle(_borrowed(arrays))
 
 

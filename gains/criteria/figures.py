@@ -39,7 +39,7 @@ def pole_region(roots: ComplexArray) -> tuple[float, float]:
     return float(ratios.min()), float(size.max())
 
 
-class FiguresAtOnce:
+class DelayFreeFigures:
     """Figures without delay, the same with and without prediction; a mix-in for dataclasses with these fields."""
 
     model: FormationModel
@@ -83,7 +83,7 @@ class FiguresAtOnce:
 
 
 @dataclass(frozen=True, eq=False)
-class LoopFigures(FiguresAtOnce):
+class LoopFigures(DelayFreeFigures):
     """Figures of a formation of one axis with a gain K (inputs, states) of u = K e, each computed when it is read.
 
     Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` holds

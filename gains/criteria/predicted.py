@@ -37,7 +37,7 @@ import numpy as np
 from gains.core._bracketing import Functions, highest
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
-from gains.criteria.figures import FiguresAtOnce
+from gains.criteria.figures import DelayFreeFigures
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
@@ -70,7 +70,7 @@ def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArra
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedFigures(FiguresAtOnce):
+class PredictedFigures(DelayFreeFigures):
     """Figures of a formation of one axis with a gain K, predicted over `assumed_s`; 0 means without prediction.
 
     Figures at a delay are the worst over the true loop delays `delays_s`. Without a `response`, vehicles respond at

@@ -218,7 +218,7 @@ def coupled_blocks(
     return blocks
 
 
-def unlike_blocks(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
+def first_of_each_kind(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
     """The first block of each kind."""
     return list({block.kind: block for block in reversed(blocks)}.values())[::-1]
 

@@ -159,7 +159,7 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
         return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     plant, entry, feedback = checked_loop(A, B, K)
     continuous_s = delay_margin(plant, entry @ feedback)
-    if hardly_sampled(timing, near_s=continuous_s):
+    if is_nearly_continuous(timing, near_s=continuous_s):
         return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
@@ -249,7 +249,7 @@ def lifted_growth(plants: Sequence[SampledPlant], timing: Timing, *, delay_s: fl
     return rate_of(radius, timing.common_s)
 
 
-def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
+def is_nearly_continuous(timing: Timing, *, near_s: float) -> bool:
     """Whether a margin near `near_s` is so long that only the mean loop delay and the mean hold time matter."""
     return _MOST_PERIODS * timing.held_s < near_s < inf
 

@@ -33,7 +33,7 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import ByContent, matrix_exponentials
-from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
+from gains.sampled.multirate import Timing, is_nearly_continuous, lifted_growth, lifted_margin
 
 # instants this close to a step (in steps) coincide with it
 _SAME_INSTANT = 1e-9
@@ -104,7 +104,7 @@ class OnboardLoop:
         if rates.commands == 1:
             return min(block_delay_margin(plant) for plant in plants)
         continuous_s = self.continuous_margin_s()
-        if hardly_sampled(rates, near_s=continuous_s):  # holding a command for T counts as a delay of T / 2
+        if is_nearly_continuous(rates, near_s=continuous_s):  # holding a command for T counts as a delay of T / 2
             one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
             return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
         return lifted_margin(plants, rates, near_s=continuous_s)

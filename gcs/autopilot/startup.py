@@ -8,7 +8,7 @@ from math import cos, degrees, isfinite, radians
 from typing import Any
 
 from gcs.autopilot.kinds import ARM, HAS_LANDED, WAS_DISARMED, Seen, kind_of, next_step
-from gcs.autopilot.vehicle_limits import ToldLimits
+from gcs.autopilot.vehicle_limits import ReportedLimits
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
 from gcs.link.startup import OPTIONAL, Startup, message_rates
@@ -49,7 +49,7 @@ class AutopilotStartup(Startup):
         self.origin: Degrees | None = None
         self.origin_altitude_m = 0.0
         """Above sea level; valid only once the origin is known."""
-        self.limits = ToldLimits()
+        self.limits = ReportedLimits()
         self._armed = self._standby = self._has_flown = self._restarted = False
         self._text = ""
         """The last text received; cleared by armed heartbeats."""
@@ -176,7 +176,7 @@ class AutopilotStartup(Startup):
         return not known
 
     @property
-    def is_half_way_up(self) -> bool:
+    def is_halfway_up(self) -> bool:
         return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
 
     def disarmed(self) -> None:

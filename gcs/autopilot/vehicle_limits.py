@@ -31,7 +31,7 @@ _LEAST, _LARGEST = 0.1, 100.0
 _ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
 
 
-class ToldLimits:
+class ReportedLimits:
     """The limits that one vehicle reports."""
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class ToldLimits:
 class Bounds:
     """Keeps the commands of a formation within the limits of each vehicle."""
 
-    def __init__(self, plan: FlightPlan, limits: Sequence[ToldLimits]) -> None:
+    def __init__(self, plan: FlightPlan, limits: Sequence[ReportedLimits]) -> None:
         self._limits = limits
         self._most_m_s2 = plan.scenario.limits.acceleration_max_m_s2 or inf
         self._period_s = 1.0 / plan.scenario.rates.control_hz

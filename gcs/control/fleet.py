@@ -48,8 +48,8 @@ class Fleet:
         self.plan = plan
         """The flight plan; after identification, with margins for the identified responses."""
         self.loop = loop_of(plan, law)
-        self.is_usual = type(self.loop) is Loop and not starts
-        """Whether steps may take the fast path of `gcs.station.usual`."""
+        self.has_fast_path = type(self.loop) is Loop and not starts
+        """Whether steps may take the fast path, `gcs.station.fast_path`."""
         launched = (
             LaunchedStartup(
                 scenario.rates.telemetry_hz,

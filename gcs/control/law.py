@@ -138,7 +138,7 @@ def unblended(vehicles: int) -> Records:
     return blends
 
 
-class Moment(NamedTuple):
+class TickInputs(NamedTuple):
     """Inputs of a control tick that are common to all vehicles."""
 
     due_ns: int
@@ -149,7 +149,7 @@ class Moment(NamedTuple):
     """Factor on the formation's spacing."""
 
 
-def formation_control(history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+def formation_control(history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
     """Errors and commands of every vehicle (n, CONTROL) from the newest reported states.
 
     `blends` holds the gains of each vehicle. A command that depends on an unknown state is NaN and must not be sent. No
@@ -160,7 +160,7 @@ def formation_control(history: Reports, law: FeedbackLaw, blends: Records, now: 
     return _controls(law, times_ns, states, seen, blends, now)
 
 
-def commands_at(states: States, law: FeedbackLaw, times_ns: Instants, blends: Records, now: Moment) -> FloatArray:
+def commands_at(states: States, law: FeedbackLaw, times_ns: Instants, blends: Records, now: TickInputs) -> FloatArray:
     """The command (n, 2) of each vehicle, from the errors at its own instant."""
     own = states.every_at(np.arange(len(times_ns)), times_ns)
     seen, others = own[law.to], (law.source != law.to).nonzero()[0]
@@ -168,13 +168,13 @@ def commands_at(states: States, law: FeedbackLaw, times_ns: Instants, blends: Re
     return commands_of(law, own, seen, blends, now)
 
 
-def commands_of(law: FeedbackLaw, own: FloatArray, seen: FloatArray, blends: Records, now: Moment) -> FloatArray:
+def commands_of(law: FeedbackLaw, own: FloatArray, seen: FloatArray, blends: Records, now: TickInputs) -> FloatArray:
     """The command (n, 2) of each vehicle, from its own state (n, 4) and the states that the law's terms use (m, 4)."""
     return _controls(law, np.ones(len(own), np.int64), own, seen, blends, now)["command_m_s2"]
 
 
 def _controls(
-    law: FeedbackLaw, times_ns: Instants, own: FloatArray, seen: FloatArray, blends: Records, now: Moment
+    law: FeedbackLaw, times_ns: Instants, own: FloatArray, seen: FloatArray, blends: Records, now: TickInputs
 ) -> Records:
     controls = np.empty(len(own), CONTROL)
     control_all(controls, law, times_ns, own, seen, blends, *now.nominal_velocity_m_s, now.opening)

@@ -18,7 +18,7 @@ from gcs.control.acted import ActiveTargets
 from gcs.control.history import Instants, Reports
 from gcs.control.law import (
     FeedbackLaw,
-    Moment,
+    TickInputs,
     Vector,
     commands_at,
     commands_of,
@@ -69,7 +69,7 @@ class Loop:
         """The station's part of each vehicle's command, without lost vehicles: see `law.feedback_law`."""
         return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         """Errors of every vehicle at a tick and the acceleration to send: see `law.formation_control`."""
         return formation_control(history, law, blends, now)
 
@@ -130,7 +130,7 @@ class PredictingGroundLoop(Loop):
         self._deliveries = _deliveries(plan)
         self._states = PredictedStates(self._sent, self._deliveries, plan.timing)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         controls = super().control(history, law, blends, now)
         acts_ns, assumed_s = self._states.look(history, now.due_ns)
         commands = commands_at(self._states, law, acts_ns, blends, now)
@@ -172,7 +172,7 @@ class StreamedLoop(Loop):
         streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost, returning))
         return feedback_law(self._plan.formation, streamed, lost, returning)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         controls = super().control(history, law, blends, now)
         used_ns = _oldest_needed_ns(law, controls["sample_ns"])
         commands = commands_at(history, law, used_ns, blends, now)
@@ -206,7 +206,7 @@ class PredictingStreamedLoop(StreamedLoop):
         super().__init__(plan)
         self._prediction = StreamPrediction(plan, _deliveries(plan))
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         controls = super().control(history, law, blends, now)
         self._prediction.look(history, law, now.due_ns, now.nominal_velocity_m_s)
         own, seen = np.zeros((len(controls), 4)), np.zeros((len(law.source), 4))

@@ -20,7 +20,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.control.history import Instants, Report, Reports, State
 from gcs.control.law import FeedbackLaw
-from gcs.control.loops import Loop, Moment, Orders, steady_loop
+from gcs.control.loops import Loop, Orders, TickInputs, steady_loop
 from gcs.control.own_law import FlownLaw, OwnLawLoop
 from gcs.plan.course import PlannedMotion
 from gcs.plan.flight_plan import FlightPlan
@@ -53,7 +53,7 @@ class ManoeuvringLoop(Loop):
         self.law, self.parameters = inner.law, inner.parameters
         self.sent, self.active = inner.sent, inner.active  # they use differences only, from which the plan cancels
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion
         controls = self._inner.control(_RelativeStates(self, history, now), law, blends, still)
         for row, down_ns in enumerate(self._down_ns):
@@ -85,7 +85,7 @@ class ManoeuvringLoop(Loop):
 class _RelativeStates(Reports):
     """`gcs.control.history.Reports` relative to the planned motion, as of one tick."""
 
-    def __init__(self, loop: ManoeuvringLoop, history: Reports, now: Moment) -> None:
+    def __init__(self, loop: ManoeuvringLoop, history: Reports, now: TickInputs) -> None:
         self._loop, self._history, self._now = loop, history, now
 
     def newest(self, vehicle: int) -> Report | None:

@@ -17,7 +17,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.control.history import Reports
 from gcs.control.law import FeedbackLaw, Vector, feedback_law
-from gcs.control.loops import Loop, Moment
+from gcs.control.loops import Loop, TickInputs
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import LawFormation, accelerations, law_formation
 from scenarios.kernel import Records
@@ -105,7 +105,7 @@ class OwnLawLoop(Loop):
         """The law with zero gains, which still gives the spacing errors and marks the lost vehicles."""
         return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost, returning)
 
-    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: Moment) -> Records:
+    def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         controls = super().control(history, law, blends, now)
         flown = law.flown
         instant_ns = controls["sample_ns"][flown].min().item() if flown.any() else 0

@@ -42,7 +42,7 @@ Motion = tuple[complex, complex, tuple[complex, ...]]
 """V, P and further states of a vehicle's motion; vectors are north + 1j * east."""
 
 
-class AtOnce:
+class LaglessMotion:
     """The motion of a vehicle that follows accelerations without lag: V' = u.
 
     The velocity change of a lost set-point is never made up.
@@ -79,8 +79,8 @@ class CommandHistory:
     Without set-points for that long, a vehicle enters its failsafe, in which it holds its velocity.
     """
 
-    def __init__(self, held_ns: int, responds: AtOnce | None = None) -> None:
-        self._held_ns, self._responds = held_ns, responds or AtOnce()
+    def __init__(self, held_ns: int, responds: LaglessMotion | None = None) -> None:
+        self._held_ns, self._responds = held_ns, responds or LaglessMotion()
         self._sent: list[_Sent] = [_Sent(0, 0j, self._responds.rest)]
         self._due_ns = [0]
         self._known = 1

@@ -17,7 +17,7 @@ import numpy as np
 
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
-from gcs.control.prediction import AtOnce, Motion
+from gcs.control.prediction import LaglessMotion, Motion
 
 _APART = 1e-3
 """Relative change of the lag that separates coincident modes; below the resolution of identification."""
@@ -34,7 +34,7 @@ class _Mode(NamedTuple):
     """The change of m per 1 m/s of owed velocity; 0 if the response has no such state."""
 
 
-class Responding(AtOnce):
+class Responding(LaglessMotion):
     """The motion (V, P and the modes m) of a vehicle with a response, for `gcs.control.prediction.CommandHistory`.
 
     The velocity in a set-point is the integral of all accelerations sent. A vehicle that holds an earlier set-point

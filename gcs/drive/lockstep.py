@@ -16,8 +16,8 @@ import numpy as np
 
 from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
+from gcs.drive.fast_path import FastPath
 from gcs.drive.guard import Guard
-from gcs.drive.usual_steps import UsualSteps
 from gcs.link import datagram
 from gcs.link.datagram import Address, Arrivals, Logged, Outbox
 from gcs.plan.flight_plan import FlightPlan
@@ -179,14 +179,14 @@ def _ticks(
 ) -> Iterator[TickArray]:
     bridge = _Bridge(plan.formation.system_ids)
     to_vehicles: Sent = bridge.to_vehicles(Outbox(), START_NS)
-    plain = guard is None and station.is_usual
-    fleet = vehicles if plain and isinstance(vehicles, Fleet) and vehicles.is_usual else None
-    usual = None if fleet is None else UsualSteps(station, fleet, bridge.addresses, bridge.rows, ahead=ahead)
+    plain = guard is None and station.has_fast_path
+    fleet = vehicles if plain and isinstance(vehicles, Fleet) and vehicles.has_fast_path else None
+    fast = None if fleet is None else FastPath(station, fleet, bridge.addresses, bridge.rows, ahead=ahead)
     while station.phase is not Phase.ENDED:
         # `Fleet.step` looks for the first set-point, at which link time begins; none is sent while CONNECTING
-        usual_now = fleet is not None and (fleet.knows_link_time or station.phase is Phase.CONNECTING)
-        if usual is not None and usual_now and isinstance(to_vehicles, Datagrams):
-            now_ns, arrived, taken = yield from usual.fly(to_vehicles)
+        is_fast = fleet is not None and (fleet.knows_link_time or station.phase is Phase.CONNECTING)
+        if fast is not None and is_fast and isinstance(to_vehicles, Datagrams):
+            now_ns, arrived, taken = yield from fast.fly(to_vehicles)
         else:
             now_ns, taken = station.next_event_ns, 0
             arrived = vehicles.step(to_vehicles, now_ns)

@@ -304,10 +304,10 @@ def checksum(data: Array, begin: int, end: int, extra: int) -> int:
 
 
 @kernel
-def usual_message(data: Array, begin: int, end: int) -> int:
-    """The message id of a datagram that holds exactly one valid, unsigned frame of a usual message; else -1.
+def common_message(data: Array, begin: int, end: int) -> int:
+    """The message id of a datagram that holds exactly one valid, unsigned frame of a common message; else -1.
 
-    Usual messages are LOCAL_POSITION_NED, TIMESYNC, HEARTBEAT and GLOBAL_POSITION_INT.
+    Common messages are LOCAL_POSITION_NED, TIMESYNC, HEARTBEAT and GLOBAL_POSITION_INT.
     """
     if end - begin < _OVERHEAD or data[begin] != MAGIC or data[begin + 2] or end - begin != _OVERHEAD + data[begin + 1]:
         return -1

@@ -39,7 +39,7 @@ class Startup(Protocol):
     """Number of refusals to arm since it was last armed."""
 
     @property
-    def is_half_way_up(self) -> bool:
+    def is_halfway_up(self) -> bool:
         """Whether it has climbed to half of its take-off altitude or more."""
         return False
 

@@ -320,7 +320,7 @@ class RemoteVehicle:
     def quiet_until_ns(self) -> float:
         """The time until which `next_frame` sends nothing and the vehicle cannot become `silent`.
 
-        Valid if its parameters are uploaded and it sends nothing unusual. 0: unknown; infinity: not heard yet.
+        Valid if its parameters are uploaded and it sends only what kernels handle. 0: unknown; infinity: not heard yet.
         """
         waiting = self._command
         if self.address is None:
@@ -331,8 +331,8 @@ class RemoteVehicle:
         return min(inf if waiting is None else waiting.sent_ns + NS_PER_S, self.heard_ns + _SILENT_NS)
 
     @property
-    def has_to_speak(self) -> bool:
-        """Whether it cannot become ready before it sends something unusual."""
+    def awaits_message(self) -> bool:
+        """Whether it cannot become ready before it sends something that kernels do not handle."""
         return not self.left_out and (self.address is None or self._next_step().command is not None)
 
     @property
@@ -385,7 +385,7 @@ class RemoteVehicle:
         """Whether the vehicle sends from another address and has been heard recently."""
         return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * NS_PER_S
 
-    def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
+    def accepts_address(self, address: Address, msg_id: int, received_ns: int) -> bool:
         """Whether a frame from a new address may be from this vehicle: only a heartbeat, at first or after silence."""
         return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
 
@@ -426,12 +426,12 @@ class RemoteVehicle:
             self.heartbeat_ns = now_ns
         return replayed
 
-    def tell_startup(self, msg_id: int, fields: tuple[Any, ...]) -> None:
+    def pass_to_startup(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         """Pass a message to the start-up, after the position that kernels have stored and not passed on."""
-        self._tell_position()
+        self._pass_position()
         self.startup.take(msg_id, fields)
 
-    def _tell_position(self) -> None:
+    def _pass_position(self) -> None:
         if self._local_is_new:
             self._local_is_new = False
             local: list[float] = self._links.known["local"][self._row].tolist()
@@ -520,7 +520,7 @@ class RemoteVehicle:
             return False
         if mode == kind.take_off_mode:
             return self._take_off_sent
-        return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and self.startup.is_half_way_up
+        return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and self.startup.is_halfway_up
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
         command, result, *_, target_system, _ = fields
@@ -578,7 +578,7 @@ class RemoteVehicle:
             return None if due is None else self.encode(*due)
         return frame
 
-    def parting_command(self) -> bytes | None:
+    def final_command(self) -> bytes | None:
         """The command to hold or land, of a station that cannot wait for the answer; None if it is not to be given."""
         if self.address is None or self.ended:
             return None
@@ -628,7 +628,7 @@ class RemoteVehicle:
 
     def _next_step(self) -> Step:
         """The next step of the start-up. Mode and arming of a vehicle flown by somebody else are left to its pilot."""
-        self._tell_position()
+        self._pass_position()
         step = self.startup.next(
             custom_mode=self.kind.guided_mode if self.external else self.custom_mode,
             armed=self.armed or self.external,

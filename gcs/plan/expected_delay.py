@@ -32,7 +32,7 @@ _PHASES, _DRAWS = 25, 200
 """Number of tick phases that are evaluated, and of draws of the phases at which several vehicles report."""
 _SAME_S, _NEVER = 1e-9, 1e-12
 """Times (s) closer than this are equal, and a probability this small stands for zero."""
-_Way = tuple[tuple[Link, ...], Link]
+_Path = tuple[tuple[Link, ...], Link]
 """The up links of the states that a vehicle's commands need, and its down link."""
 
 
@@ -87,47 +87,47 @@ def expected_loop_delays_s(
     `heard` names other vehicles for a vehicle, it counts from the oldest of their states instead of its own. The time
     that datagrams wait for a channel is not included (`waits_for_channels`).
     """
-    ways = _ways(scenario, heard)
-    unlike = dict.fromkeys(ways.values())
+    paths = _paths(scenario, heard)
+    unlike = dict.fromkeys(paths.values())
     rates = scenario.rates
     in_turn = rates.telemetry_hz < rates.control_hz and any(len(ups) > 1 for ups, _ in unlike)
     if in_turn or any(_is_random(link) for ups, down in unlike for link in (*ups, down)):
         around_s = {
-            way: float(np.median(drawn.loop_s, axis=1).mean()) for way, drawn in _drawn(scenario, unlike).items()
+            path: float(np.median(drawn.loop_s, axis=1).mean()) for path, drawn in _drawn(scenario, unlike).items()
         }
     else:
         waiting_s = 0.5 / max(rates.telemetry_hz, rates.control_hz)
         around_s = {
             (ups, down): max(up.delay_max_s for up in ups) + down.delay_max_s + waiting_s for ups, down in unlike
         }
-    return {own: around_s[way] for own, way in ways.items()}
+    return {own: around_s[path] for own, path in paths.items()}
 
 
 def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
     """Delays drawn over the links of each of a plan's vehicles; `planned_loop_delays_s` has their medians."""
-    ways = _ways(plan.scenario, _heard(plan))
-    drawn = _drawn(plan.scenario, dict.fromkeys(ways.values()))
-    return {own: drawn[way] for own, way in ways.items()}
+    paths = _paths(plan.scenario, _heard(plan))
+    drawn = _drawn(plan.scenario, dict.fromkeys(paths.values()))
+    return {own: drawn[path] for own, path in paths.items()}
 
 
 def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
     """Loop delays (s) at random ticks (k,), drawn over one vehicle's links as `expected_loop_delay_s` draws them."""
-    way = (up,), down
-    return _drawn(scenario, [way])[way].loop_s.ravel()
+    path = (up,), down
+    return _drawn(scenario, [path])[path].loop_s.ravel()
 
 
-def _ways(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int, _Way]:
+def _paths(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int, _Path]:
     """For each vehicle the up links of the states that its commands need, and its down link."""
     links = {vehicle.system_id: scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
     states_of = {own: sorted(heard.get(own) or [own]) for own in links}
     return {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
 
 
-def _drawn(scenario: Scenario, ways: Collection[_Way]) -> dict[_Way, DrawnDelays]:
+def _drawn(scenario: Scenario, paths: Collection[_Path]) -> dict[_Path, DrawnDelays]:
     rng = np.random.default_rng(0)
-    ages_s = {ups: _ages_s(scenario, ups, rng) for ups in dict.fromkeys(ups for ups, _ in ways)}
-    late_s = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in ways)}
-    return {(ups, down): DrawnDelays(ages_s[ups], rng.choice(late_s[down], ages_s[ups].shape)) for ups, down in ways}
+    ages_s = {ups: _ages_s(scenario, ups, rng) for ups in dict.fromkeys(ups for ups, _ in paths)}
+    late_s = {down: _arrival_delays_s(scenario, down, rng) for down in dict.fromkeys(down for _, down in paths)}
+    return {(ups, down): DrawnDelays(ages_s[ups], rng.choice(late_s[down], ages_s[ups].shape)) for ups, down in paths}
 
 
 def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
@@ -137,13 +137,13 @@ def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     command stays in force (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to nothing arrives.
     A prediction knows the age of each state, whatever was lost, so only the mean delay of set-points counts.
     """
-    scenario, ways, expected_s = plan.scenario, _ways(plan.scenario, _heard(plan)), planned_loop_delays_s(plan)
-    rng, found = np.random.default_rng(0), dict[_Way, float]()
-    for own, (ups, down) in ways.items():
+    scenario, paths, expected_s = plan.scenario, _paths(plan.scenario, _heard(plan)), planned_loop_delays_s(plan)
+    rng, found = np.random.default_rng(0), dict[_Path, float]()
+    for own, (ups, down) in paths.items():
         counting = (down,) if scenario.control.prediction != "off" else (*ups, down)
         if (ups, down) not in found and any(_is_random(link) for link in counting):
             found[ups, down] = _effective_s(plan, ups, down, expected_s[own], rng)
-    return {own: found.get(way, expected_s[own]) for own, way in ways.items()}
+    return {own: found.get(path, expected_s[own]) for own, path in paths.items()}
 
 
 def _effective_s(

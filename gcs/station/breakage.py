@@ -95,7 +95,7 @@ class Breakage:
 
     def _come_back(self, row: int, controls: Records, time_s: float) -> None:
         """Give a vehicle and all behind it time to return, once their distances are known."""
-        distances_m = [self._way_m(controls[other]) for other in self._behind[row]]
+        distances_m = [self._distance_ahead_m(controls[other]) for other in self._behind[row]]
         if not isfinite(distances_m[0]):
             return
         self._away[row] = False
@@ -108,7 +108,7 @@ class Breakage:
         for other in self._behind[row]:
             self._judged_from_s[other] = max(self._judged_from_s[other], until_s)
 
-    def _way_m(self, control: Record) -> float:
+    def _distance_ahead_m(self, control: Record) -> float:
         """The spacing error plus the distance covered while the velocity error decays; NaN while unknown."""
         spacing_m = hypot(*control["spacing_error_m"].tolist())
         carried_m = hypot(*control["velocity_error_m_s"].tolist()) / self._decay_1_s if self._decay_1_s > 0 else 0.0

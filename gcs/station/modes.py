@@ -121,7 +121,7 @@ def next_state(state: Record, seen: Observation, margins_s: Array, policy: Polic
         state.mode = _NOMINAL
     else:
         own = _headroom(seen.loop_delay_s, margins_s[state.gain_set])
-        if not is_at_ease(state) or not own >= policy.caution_headroom:
+        if not is_settled(state) or not own >= policy.caution_headroom:
             # a released vehicle returns to the slowest set
             faster = own if state.released else _headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
             _by_headroom(state, own, faster, slowest, policy, seen.time_s)
@@ -153,7 +153,7 @@ def _by_headroom(state: Record, own: float, faster: float, slowest: int, policy:
 
 
 @kernel
-def is_at_ease(state: Record) -> bool:
+def is_settled(state: Record) -> bool:
     """Whether a vehicle is NOMINAL and no timer runs."""
     return state.mode == _NOMINAL and state.pressed_s == inf and state.eased_s == inf
 

@@ -23,7 +23,7 @@ from gains.core.arrays import FloatArray
 from gcs.control.law import unblended
 from gcs.control.loop_delay import headroom
 from gcs.control.tick import Mode
-from gcs.station.modes import STATE, Observation, Policy, VehicleState, is_at_ease, next_state, policy_of
+from gcs.station.modes import STATE, Observation, Policy, VehicleState, is_settled, next_state, policy_of
 from scenarios.kernel import Array, Record, Records, kernel
 from scenarios.schema import Monitor
 
@@ -140,7 +140,7 @@ def _is_calm(
     margins_s: Array, policy: Policy,
 ) -> bool:  # fmt: skip
     """Whether a vehicle is heard, guided and at ease, with enough headroom: true at most ticks."""
-    if seen.silent[row] or not seen.guided[row] or not is_at_ease(state):
+    if seen.silent[row] or not seen.guided[row] or not is_settled(state):
         return False
     margin_s, caution = margins_s[state.gain_set], policy.caution_headroom
     if not separable:

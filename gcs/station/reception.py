@@ -24,9 +24,9 @@ from gcs.link.mavlink import (
     HEARTBEAT,
     LOCAL_POSITION_NED,
     TIMESYNC,
+    common_message,
     float_at,
     unsigned_at,
-    usual_message,
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
 from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns
@@ -117,7 +117,7 @@ class Reception:
         self.counters: Counter[str] = Counter()
         """Number of refused frames, by reason."""
         self.touched: set[int] = set()
-        """Rows of vehicles that have sent something unusual since `touched` was last cleared."""
+        """Rows of vehicles that have sent something kernels do not handle since `touched` was last cleared."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
@@ -156,7 +156,7 @@ class Reception:
         now = Now(now_ns, self._start_ns, self._period_ns, self._fleet.loop.heeds_deliveries)
         while place < count:
             senders = self.numbered(arrivals.addresses)
-            stop = take_usual(
+            stop = take_common(
                 self.tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self.row_of, senders, now
             )
             if stop > place:
@@ -204,7 +204,7 @@ class Reception:
                     self.frames.append((frame.data, datagram.received_ns, datagram.address))
                 continue
             if vehicle.address != datagram.address:
-                if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
+                if not vehicle.accepts_address(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
                     if frame.msg_id == HEARTBEAT:
                         vehicle.note_rival(datagram.address, datagram.received_ns)
@@ -261,7 +261,7 @@ class Reception:
                     self._report("statustext", text, vehicle.system_id)
             case _:
                 pass
-        vehicle.tell_startup(frame.msg_id, fields)
+        vehicle.pass_to_startup(frame.msg_id, fields)
 
     def _follow_up(self, outgoing: Outbox) -> None:
         """Do the work that kernels have left to Python."""
@@ -308,16 +308,16 @@ def take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
 
 
 @kernel
-def take_usual(
+def take_common(
     tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, senders: Array, now: Now
 ) -> int:
-    """Process datagrams from `first` on; returns the index of the first that is not usual, or their number if all are.
+    """Process datagrams from `first` on; returns the index of the first that needs Python, else their number.
 
     Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `Reception.numbered` returns.
     """
     for place in range(first, table.shape[1]):
         begin, end, sender, received_ns = table[0, place], table[1, place], table[2, place], table[3, place]
-        msg_id = usual_message(stream, begin, end)
+        msg_id = common_message(stream, begin, end)
         if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
             return place
         row = row_of[senders[0, sender], stream[begin + 5]]
@@ -340,7 +340,7 @@ def _take_frame(
     queued_ns: int,
     now: Now,
 ) -> bool:
-    """Process a frame of a usual message; does nothing and returns False if it may need more than kernels can do."""
+    """Process a frame of a common message; does nothing and returns False if it may need more than kernels can do."""
     link, payload, payload_end = tables.links[row], begin + _HEADER_BYTES, end - _CHECKSUM_BYTES
     state = _state_at(stream, payload, payload_end)
     tc1_ns = int64(unsigned_at(stream, payload, 8, payload_end))

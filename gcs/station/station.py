@@ -14,7 +14,7 @@ from gains.core.arrays import FloatArray, IntArray
 from gcs.control.law import nearest
 from gcs.control.limits import LARGEST_COMMAND_M_S2, shorten
 from gcs.control.loop_delay import repeated_s
-from gcs.control.loops import Moment, Orders
+from gcs.control.loops import Orders, TickInputs
 from gcs.control.own_law import FlownLaw
 from gcs.control.phases import END_PATIENCE_S, Phase, next_phase, patience_s
 from gcs.control.tick import GAIN_SET, NOT_CONFIRMED, SEVERITY, Mode, TickArray
@@ -26,22 +26,22 @@ from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, in_words, 
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import GROUNDED, LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
+from gcs.station.fast_path import (
+    DUE,
+    HEARTBEAT_NS,
+    SCHEDULE,
+    FastPathData,
+    commanded,
+    fast_set_points,
+    limits_of,
+    new_scratch,
+    requested,
+)
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.journal import Journal
 from gcs.station.monitor import FormationMonitor, Seen
 from gcs.station.reception import Reception, take_fresh
 from gcs.station.tick_rows import Judged, Tick, tick_rows
-from gcs.station.usual import (
-    DUE,
-    HEARTBEAT_NS,
-    SCHEDULE,
-    Usual,
-    commanded,
-    limits_of,
-    new_scratch,
-    requested,
-    usual_set_points,
-)
 from scenarios.kernel import Cell, Columns, Records
 from scenarios.schema import NS_PER_S
 
@@ -143,11 +143,11 @@ class Station:
 
     def abandoned(self) -> Outbox:
         """Commands to hold or land for every vehicle in flight: what a driver sends when an exception ends it."""
-        commands = [(vehicle.parting_command(), vehicle.address) for vehicle in self.vehicles]
+        commands = [(vehicle.final_command(), vehicle.address) for vehicle in self.vehicles]
         return Outbox([(frame, address) for frame, address in commands if frame is not None and address is not None])
 
     def step(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> tuple[Outbox, Tick | None]:
-        """Process datagrams, except the first `taken`, which a usual step has processed, and do what is due.
+        """Process datagrams, except the first `taken`, which a fast step has processed, and do what is due.
 
         Returns
         -------
@@ -158,7 +158,7 @@ class Station:
         outgoing = self._reception.take(datagrams, now_ns, taken)
         if now_ns >= self.next_tick_ns:
             # set-points do not wait for heartbeats and requests, which can have their own step
-            return outgoing, self._usual_tick(outgoing) or self._tick(outgoing)
+            return outgoing, self._fast_tick(outgoing) or self._tick(outgoing)
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + HEARTBEAT_NS
             outgoing.add(heartbeats_to(self._fleet.links))
@@ -169,11 +169,11 @@ class Station:
         return outgoing, None
 
     @property
-    def usual(self) -> Usual:
-        """The arguments of usual steps; valid until the next step in Python, which may replace parts of them."""
+    def fast_path_data(self) -> FastPathData:
+        """The data of fast steps; valid until the next step in Python, which may replace parts of them."""
         monitor, tolerated = self._monitor, self._tolerated
         assert tolerated is not None
-        return Usual(
+        return FastPathData(
             self._schedule, self._limits, self._reception.tables, self._reception.row_of, self._law,
             monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
             self._critical, tolerated[0], self._used_s, self._repeated_ns, self._system_ids, self._targets,
@@ -181,14 +181,14 @@ class Station:
         )  # fmt: skip
 
     @property
-    def is_usual(self) -> bool:
-        """Whether steps may take the fast path of `gcs.station.usual`."""
-        return self._fleet.is_usual and self._tolerated is not None
+    def has_fast_path(self) -> bool:
+        """Whether steps may take the fast path of `gcs.station.fast_path`."""
+        return self._fleet.has_fast_path and self._tolerated is not None
 
     def look_ahead(self, ticks: Records, most: int) -> int:
-        """Fill in, for up to `most` ticks ahead, the data that usual steps need; `ticks` are records of DUE.
+        """Fill in, for up to `most` ticks ahead, the data that fast steps need; `ticks` are records of DUE.
 
-        Returns the number of ticks that may be usual. A step in Python in between invalidates the rest.
+        Returns the number of ticks that may be fast. A step in Python in between invalidates the rest.
         """
         next_ns, flying = self.next_tick_ns, self.phase is Phase.FLYING
         waiting = self._reception.touched or self._gone or self._returning
@@ -198,11 +198,11 @@ class Station:
             return 0
         quiet_until_ns, longest_s = inf if flying else self._quiet_until_ns(), self._longest_phase_s
 
-        def may_be_usual(place: int) -> bool:
+        def may_be_fast(place: int) -> bool:
             due_ns = next_ns + place * self._period_ns
             return due_ns < quiet_until_ns and self._waited_s(due_ns) < longest_s
 
-        count = most if may_be_usual(most - 1) else sum(map(may_be_usual, range(most)))
+        count = most if may_be_fast(most - 1) else sum(map(may_be_fast, range(most)))
         if not count:
             return 0
         times_s, scenario = self.scenario_time_s(next_ns + self._period_ns * np.arange(count)), self.plan.scenario
@@ -213,7 +213,7 @@ class Station:
         return count
 
     def _quiet_until_ns(self) -> float:
-        """The time before which ticks outside the flight have nothing to do unless a vehicle sends something unusual.
+        """The time before which ticks outside the flight have nothing to do, if vehicles send only what kernels handle.
 
         0 if unknown; see also `_longest_phase_s`.
         """
@@ -223,7 +223,7 @@ class Station:
             waits = not self._all_ended
         else:
             connects = self.phase is Phase.CONNECTING and not self._journal.stop
-            waits = connects and (self._awaited_clock >= 0 or any(vehicle.has_to_speak for vehicle in self.vehicles))
+            waits = connects and (self._awaited_clock >= 0 or any(vehicle.awaits_message for vehicle in self.vehicles))
         return min(vehicle.quiet_until_ns for vehicle in self.vehicles) if waits else 0
 
     @property
@@ -305,12 +305,12 @@ class Station:
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
-    def _usual_tick(self, outgoing: Outbox) -> Tick | None:
+    def _fast_tick(self, outgoing: Outbox) -> Tick | None:
         """Do the tick due now with a kernel if possible, else return None."""
         due_ns = self.next_tick_ns
-        if self.phase is not Phase.FLYING or not self.is_usual or not self.look_ahead(self._due, 1):
+        if self.phase is not Phase.FLYING or not self.has_fast_path or not self.look_ahead(self._due, 1):
             return None
-        done, set_points = usual_set_points(self.usual, self._due)
+        done, set_points = fast_set_points(self.fast_path_data, self._due)
         if not done:
             return None
         indices = self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing)
@@ -326,7 +326,7 @@ class Station:
         time_s = self.scenario_time_s(due_ns)
         nominal_m_s = self.plan.scenario.nominal_velocity_at(time_s)
         blends = self._monitor.blends(time_s)
-        now = Moment(due_ns, time_s, nominal_m_s, self._monitor.opening)
+        now = TickInputs(due_ns, time_s, nominal_m_s, self._monitor.opening)
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
         self._fleet.bound(controls, blends)
         shorten(controls["command_m_s2"], self._limits.acceleration_m_s2)

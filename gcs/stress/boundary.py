@@ -14,7 +14,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.several import boundary_of_two_delays, late_by_vehicle
 from gains.performance.response import formation_loop
-from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
+from gains.sampled.coupled_block import CoupledBlock, first_of_each_kind
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gains.varying.predicted import PredictedSpread
@@ -124,7 +124,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
         return None
     delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
-    blocks = unlike_blocks(plan_loops(study.plan))
+    blocks = first_of_each_kind(plan_loops(study.plan))
     if scenario.control.prediction == "off":
         jitter_s = _proved_s(blocks, study.plan.timing.held_s, delays_s)
     else:

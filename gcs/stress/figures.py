@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gains.sampled.coupled_block import unlike_blocks
+from gains.sampled.coupled_block import first_of_each_kind
 from gcs.plan.expected_delay import planned_loop_delays_s
 from gcs.plan.loops import growth_of, is_modelled, plan_loops
 from gcs.stress.axes import Axis, place_text
@@ -89,7 +89,7 @@ def _draw_models(above: Any, study: Study, delays_s: FloatArray, vehicle: int | 
         rates, label = map(growth_of(study.plan, vehicle), some_s.tolist()), "model, the other links as in the scenario"
         above.plot(some_s, list(rates), color=SAMPLED, linewidth=1.4, label=label)
         return
-    kinds = unlike_blocks(blocks)
+    kinds = first_of_each_kind(blocks)
     sampled = np.array([[kind.growth_1_s(at) for at in delays_s.tolist()] for kind in kinds])
     fastest = [kinds[k] for k in sampled.argmax(axis=0)[::_SPARSE]]
     continuous = [kind.growth_continuous_1_s(at) for kind, at in zip(fastest, some_s.tolist(), strict=True)]

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import PlainSerializer
 
-from gains.sampled.coupled_block import unlike_blocks
+from gains.sampled.coupled_block import first_of_each_kind
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import is_modelled, plan_loops, unstable_over_links, window_of
 from gcs.plan.mismatch import Window
@@ -330,7 +330,7 @@ def _found(
     assert nearest.critical is not None
     block = next(block for block in blocks if nearest.probed in block.system_ids)
     end, way = (0, -1.0) if shorter else (1, 1.0)
-    ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(blocks)]
+    ends_s = [way * kind.window_s()[end] for kind in first_of_each_kind(blocks)]
     # for the loop that breaks first, test the margin that the station flies by
     own_s = block.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
@@ -342,7 +342,7 @@ def _found(
     link_s = zero.varied - waiting_s
     seed = study.plan.scenario.seed
     at_onset = slowed.at(round(link_s, 6))
-    others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]
+    others = [unlike.system_ids[0] for unlike in first_of_each_kind(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     others = [own for own in others if vehicle is None or own not in block.system_ids]
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])

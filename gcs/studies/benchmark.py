@@ -225,7 +225,7 @@ def without_solver(scenario: Scenario, seconds: float) -> Scenario:
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
 
 
-def not_plain(scenario: Scenario) -> str | None:
+def first_unsupported_key(scenario: Scenario) -> str | None:
     """The key of the scenario that a plain station cannot fly, with what was read and wanted; None if there is none."""
     for key, read, wanted in (
         ("dynamics", scenario.dynamics, "double_integrator"),

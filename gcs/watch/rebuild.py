@@ -19,7 +19,7 @@ import numpy as np
 from gcs.control.history import StateHistory
 from gcs.control.law import nearest, unblended
 from gcs.control.loop_delay import longest_repetition_ns, repeated_s
-from gcs.control.loops import Moment, Vector
+from gcs.control.loops import TickInputs, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
 from gcs.link.clocks import UNANSWERED
@@ -182,7 +182,7 @@ class _Rebuilding:
         self._close_tick()
         self._look(time_ns)
         if station and frame.msg_id == mavlink.STATUSTEXT:
-            self._take_told(time_ns, frame)
+            self._apply_announced(time_ns, frame)
         vehicle = self.watch.take(frame, time_ns)
         self.watch.look(time_ns)
         row = self._row.get(frame.system_id)
@@ -221,7 +221,7 @@ class _Rebuilding:
                 self._tick(self._grid_ns, {}, 0)
             self._grid_ns += self._period_ns
 
-    def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
+    def _apply_announced(self, time_ns: int, frame: mavlink.Frame) -> None:
         """Apply a mode or a gain set that the station announced."""
         system_id, announced = _announced(frame) or (0, "")
         row = self._row.get(system_id)
@@ -275,7 +275,7 @@ class _Rebuilding:
         lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
         if lost != self._lost:
             self._lost, self._law = lost, self._fleet.loop.law(lost)
-        now = Moment(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
+        now = TickInputs(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
         controls = self._fleet.loop.control(self._history, self._law, unblended(len(lost)), now)
         why = [absence(own.remote, gone=gone) for own, gone in zip(self._vehicles, lost, strict=True)]
         grounded = {

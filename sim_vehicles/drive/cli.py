@@ -178,7 +178,7 @@ def _stop_rule(
             if commanded_ns == start_ns:
                 return True  # nobody has flown them, so nobody will take them over
             if fleet is not None:
-                fleet.orphan()
+                fleet.mark_orphaned()
         if fleet is not None and now_ns - fleet.shut_down_ns >= GOODBYE_NS:
             return True
         silent = now_ns - max(commanded_ns, alone_since_ns) >= silence_ns

@@ -50,7 +50,7 @@ class _Member:
 
 
 class FleetArrays(NamedTuple):
-    """The arrays on which a kernel runs the usual events of a fleet."""
+    """The arrays on which a kernel runs the common events of a fleet."""
 
     vehicles: Records
     links: Records
@@ -72,8 +72,8 @@ class Fleet:
     depend on the errors of all. With any of these, events run in order of time; at equal times the station's datagrams
     enter their links first, then the disturbance acts, then the vehicles by system id.
 
-    One kernel call (`vehicles.plain`) lets the station's datagrams enter, runs the usual events of all plain vehicles
-    and collects what leaves. Python runs the rest, vehicle by vehicle: the unusual events of plain vehicles, and all
+    One kernel call (`vehicles.plain`) lets the station's datagrams enter, runs the common events of all plain vehicles
+    and collects what leaves. Python runs the rest, vehicle by vehicle: the other events of plain vehicles, and all
     events of the others.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and pass on to the
@@ -149,7 +149,7 @@ class Fleet:
         told_ns = [member.vehicle.services.shut_down_ns for member in self._members.values()]
         return NEVER_NS if None in told_ns else max(ns for ns in told_ns if ns is not None)
 
-    def orphan(self) -> None:
+    def mark_orphaned(self) -> None:
         """From now on the vehicles obey a command to shut down: the station that started them has gone."""
         for member in self._members.values():
             member.vehicle.services.orphaned = True
@@ -229,7 +229,7 @@ class Fleet:
         return out
 
     @property
-    def is_usual(self) -> bool:
+    def has_fast_path(self) -> bool:
         """Whether `step` does nothing before `step_all` except notice when the links' time begins."""
         return self._external is None and not self._in_order
 

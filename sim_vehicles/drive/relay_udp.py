@@ -7,7 +7,7 @@ to that socket go through the down link to the address from which the vehicle la
 from scenarios.schema import NS_PER_S
 from scenarios.sockets import Received
 from sim_vehicles.drive.udp import Sockets
-from sim_vehicles.links.relay import Passing, holds_key, sender
+from sim_vehicles.links.relay import InTransit, holds_key, sender
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.vehicles.shell import Change
 
@@ -45,21 +45,21 @@ class Peers:
             self.sockets.close()
             raise
 
-    def receive(self) -> list[Passing]:
+    def receive(self) -> list[InTransit]:
         """Everything that has arrived, from either side."""
-        received: list[Passing] = []
+        received: list[InTransit] = []
         for datagram in self.sockets.receive():
             if holds_key(datagram.data):
                 self.sockets.counters["refused_setup_signing"] += 1
                 continue
             system_id = self._system_ids.get(datagram.descriptor)
             if system_id is not None:
-                received.append(Passing(datagram.time_ns, LINK_DOWN, system_id, datagram.data))
+                received.append(InTransit(datagram.time_ns, LINK_DOWN, system_id, datagram.data))
             elif (system_id := self._vehicle(datagram)) is not None:
-                received.append(Passing(datagram.time_ns, LINK_UP, system_id, datagram.data))
+                received.append(InTransit(datagram.time_ns, LINK_UP, system_id, datagram.data))
         return received
 
-    def send(self, passing: list[Passing]) -> None:
+    def send(self, passing: list[InTransit]) -> None:
         sent: list[tuple[bytes, int, int, tuple[str, int] | None]] = []
         for due_ns, kind, system_id, data in passing:
             up = kind == LINK_UP

@@ -21,7 +21,7 @@ from sim_vehicles.services.mavlink import MAGIC_1, MAGIC_2
 SETUP_SIGNING = (256).to_bytes(3, "little")
 
 
-class Passing(NamedTuple):
+class InTransit(NamedTuple):
     """A datagram on its way through the links, up to the station or down to the vehicle. Sorts by time."""
 
     time_ns: int
@@ -62,7 +62,7 @@ class Relay:
         self._recorder = recorder
         most = max(MOST_IN_NETWORK, len(scenario.vehicles))
         self._links = LinkSet(scenario, start_ns, recorder=recorder, most=most)
-        self._entering: list[Passing] = []
+        self._entering: list[InTransit] = []
         """Datagrams stamped later than the last step: an earlier one may still be unread."""
 
     @property
@@ -75,7 +75,7 @@ class Relay:
         due_ns = self._links.next_due_ns
         return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
 
-    def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
+    def step(self, received: Iterable[InTransit], now_ns: int) -> list[InTransit]:
         """The datagrams that leave the links by now, with their exact times, in order of time."""
         entering = self._entering
         for passing in received:
@@ -88,10 +88,10 @@ class Relay:
                     self._links.hear(data, time_ns)
             up, down = self._links.of(system_id)
             (up if kind == LINK_UP else down).send(data, time_ns)
-        out: list[Passing] = []
+        out: list[InTransit] = []
         for link in self._links.due(now_ns):
             for entry in link.due(now_ns):
-                out.append(Passing(entry[0], link.kind, link.system_id, entry[3]))
+                out.append(InTransit(entry[0], link.kind, link.system_id, entry[3]))
                 if self._recorder is not None:
                     self._recorder.add(link.row(entry, now_ns))
         out.sort(key=itemgetter(0, 1, 2))

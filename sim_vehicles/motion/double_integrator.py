@@ -143,7 +143,7 @@ def shifted(state: State, north_m: float, east_m: float, north_m_s: float, east_
 
 
 @kernel
-def push_on(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
+def move_under_push(vehicle: Record, piece: tuple[float, float, float, float, float]) -> None:
     """Move a flying vehicle over an interval of constant push, a `Piece` of `air`."""
     t, half_north, half_east, north, east = piece
     state = shifted(state_of(vehicle), 0.0, 0.0, half_north, half_east)

@@ -16,7 +16,7 @@ NEVER_ASKED = -1
 VEHICLE = np.dtype(
     [
         ("system_id", "i8"), ("wire_id", "i8"),
-        ("plain", "?"),  # whether kernels may run its usual events: `sim_vehicles.vehicles.plain`
+        ("plain", "?"),  # whether kernels may run its common events: `sim_vehicles.vehicles.plain`
         ("pushed", "?"),  # whether a disturbance pushes it: the craft then moves it before each event that kernels run
         ("acts_ns", "i8"),  # when it next acts if nothing arrives
         ("sequence", "i8"),  # number of the next frame

@@ -40,7 +40,7 @@ LAG_INTERVAL_US = 200_000
 """Time between two reports of the lag after which held set-points act."""
 
 
-_push_on_at, _advance_to_at = at_row(motion.push_on), at_row(motion.advance_to)
+_push_on_at, _advance_to_at = at_row(motion.move_under_push), at_row(motion.advance_to)
 
 
 class DoubleIntegrator:

@@ -1,8 +1,8 @@
-"""Runs the usual events of plain vehicles in kernels: the station's set-points, heartbeats and TIMESYNC, and reports.
+"""Runs the common events of plain vehicles in kernels: the station's set-points, heartbeats and TIMESYNC, and reports.
 
 A plain craft is a double integrator whose set-points act at once, and which reports its true state (`Craft.is_plain`).
 If its links are plain, too (`Link.plain`), a kernel runs its events in order of time, as `Shell` does, and stops before
-an unusual one.
+one that takes Python.
 """
 
 from math import copysign, cos, pi, sin, tau
@@ -44,11 +44,11 @@ from sim_vehicles.services.schedule import schedule_report
 from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, takes_setpoints
 from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
 
-UNUSUAL, MOVE_FIRST, SILENT = -2, -1, 0
-"""Returned in place of a frame's size. UNUSUAL, MOVE_FIRST: nothing was done, as the event is unusual or the craft must
+NEEDS_PYTHON, MOVE_FIRST, SILENT = -2, -1, 0
+"""Returned in place of a frame's size. NEEDS_PYTHON, MOVE_FIRST: nothing was done; the event takes Python, or the craft must
 move first. SILENT: done, with no frame to send."""
 _SETPOINT_BYTES, _HEARTBEAT_BYTES = 53, 9
-"""Sizes of complete payloads: usual set-points and heartbeats do not end in zeros."""
+"""Sizes of complete payloads: common set-points and heartbeats do not end in zeros."""
 
 
 @kernel
@@ -59,29 +59,29 @@ def _must_move(vehicle: Record, time_ns: int) -> bool:
 
 @kernel
 def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame, truth: Records) -> int:
-    """Act on a datagram that arrives; returns the size of the answer, SILENT, UNUSUAL or MOVE_FIRST."""
+    """Act on a datagram that arrives; returns the size of the answer, SILENT, NEEDS_PYTHON or MOVE_FIRST."""
     number = frequent_message(frame, size)
     if number == SETPOINT:
         return _take_setpoint(vehicle, frame, time_ns, truth)
     if number == HEARTBEAT:
         return _take_heartbeat(vehicle, frame, time_ns)
-    return _take_timesync(vehicle, frame, time_ns, answer) if number == TIMESYNC else UNUSUAL
+    return _take_timesync(vehicle, frame, time_ns, answer) if number == TIMESYNC else NEEDS_PYTHON
 
 
 @kernel
 def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) -> int:
     """Fly an acceleration that the station commands in flight."""
     if frame[1] != _SETPOINT_BYTES or frame[5] != vehicle.station or not takes_setpoints(vehicle):
-        return UNUSUAL
+        return NEEDS_PYTHON
     mask, component = read_uint16(frame, PAYLOAD + 48), frame[PAYLOAD + 51]
     if mask & (AXES | FORCE_SET) != ACCELERATION or frame[PAYLOAD + 52] != LOCAL_NED:
-        return UNUSUAL
+        return NEEDS_PYTHON
     if frame[PAYLOAD + 50] != vehicle.wire_id or component not in (0, AUTOPILOT):
-        return UNUSUAL
+        return NEEDS_PYTHON
     north, east = read_float(frame, PAYLOAD + 28), read_float(frame, PAYLOAD + 32)
     down = read_float(frame, PAYLOAD + 36)
     if not abs(north) + abs(east) + abs(down) <= ABSURD:  # also if NaN
-        return UNUSUAL
+        return NEEDS_PYTHON
     acts_ns = max(time_ns, vehicle.state_ns)
     if _must_move(vehicle, acts_ns):
         return MOVE_FIRST
@@ -98,7 +98,7 @@ def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) 
 @kernel
 def _take_heartbeat(vehicle: Record, frame: Frame, time_ns: int) -> int:
     if frame[1] != _HEARTBEAT_BYTES or frame[5] != vehicle.station or frame[PAYLOAD + 4] != STATION_TYPE:
-        return UNUSUAL
+        return NEEDS_PYTHON
     vehicle.heard_ns = time_ns
     note_heartbeat(vehicle, max(time_ns, vehicle.state_ns))
     vehicle.heartbeats += 1
@@ -111,11 +111,11 @@ def _take_timesync(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -
     size = int(frame[1])
     target = frame[PAYLOAD + 16] if size > 16 else 0
     if target not in (0, vehicle.wire_id):
-        return UNUSUAL
+        return NEEDS_PYTHON
     ts1 = read_int64(frame, PAYLOAD + 8, min(max(size - 8, 0), 8))
     if read_int64(frame, PAYLOAD + 0, min(size, 8)) != 0:
         if ts1 != vehicle.asked_ts1:
-            return UNUSUAL
+            return NEEDS_PYTHON
         vehicle.timesync_replies += 1
         return SILENT
     tc1 = boot_ns(vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb, time_ns)
@@ -134,7 +134,7 @@ def report(vehicle: Record, frame: Frame, truth: Records) -> int:
     north, east, yaw, speed = state_of(vehicle)
     heading = _within_half_a_turn(yaw)
     if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
-        return UNUSUAL
+        return NEEDS_PYTHON
     schedule_report(vehicle, k, vehicle.number[k] + 1)
     if REPORTS[k] == TIMESYNC:
         clock = vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb
@@ -163,18 +163,22 @@ def _within_half_a_turn(angle: float) -> float:
 
 @kernel
 def hear_at(vehicles: Records, row: int, data: Bytes, time_ns: int, frames: Bytes, truth: Records) -> int:
-    """As `hear`; `frames` has room for the datagram and for the answer. UNUSUAL if `truth` has no room."""
+    """As `hear`; `frames` has room for the datagram and for the answer. NEEDS_PYTHON if `truth` has no room."""
     if not can_record(truth):
-        return UNUSUAL
+        return NEEDS_PYTHON
     copy_bytes(frames[0], 0, data, 0, len(data))
     return hear(vehicles[row], frames[0], len(data), time_ns, frames[1], truth)
 
 
 @kernel
 def report_at(vehicles: Records, row: int, frames: Bytes, truth: Records) -> int:
-    """As `report`, into the second of `frames`; UNUSUAL if another message is due by then, or `truth` has no room."""
+    """As `report`, into the second of `frames`; NEEDS_PYTHON if another message is due by then or `truth` is full."""
     vehicle = vehicles[row]
-    return report(vehicle, frames[1], truth) if can_record(truth) and vehicle.report_ns < vehicle.other_ns else UNUSUAL
+    return (
+        report(vehicle, frames[1], truth)
+        if can_record(truth) and vehicle.report_ns < vehicle.other_ns
+        else NEEDS_PYTHON
+    )
 
 
 @kernel
@@ -182,7 +186,7 @@ def run(
     vehicle: Record, up: Record, down: Record, entries: Records, frames: Bytes, draws: Records, truth: Records,
     now_ns: int,
 ) -> bool:  # fmt: skip
-    """Run a plain vehicle until now; False if it stops before an unusual event. `draws` are those of its up link."""
+    """Run a plain vehicle until now; False if it stops before an event that takes Python. `draws`: of its up link."""
     while True:
         acts_ns = min(vehicle.deadline_ns, vehicle.report_ns, vehicle.other_ns)
         vehicle.acts_ns = acts_ns
@@ -191,7 +195,7 @@ def run(
             return True
         if not ready(up, entries, truth):
             return False
-        entry, size = new_entry(entries), UNUSUAL
+        entry, size = new_entry(entries), NEEDS_PYTHON
         if down.next_due_ns == time_ns:
             arrived = entries[down.first]
             size = hear(vehicle, frames[down.first], arrived.size, time_ns, frames[entry], truth)
@@ -242,7 +246,7 @@ def run_at(
     vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     row: int, now_ns: int,
 ) -> bool:  # fmt: skip
-    """Run the plain vehicle in a row until now; False if it stops before an unusual event."""
+    """Run the plain vehicle in a row until now; False if it stops before an event that takes Python."""
     up, down = row_of(row, LINK_UP), row_of(row, LINK_DOWN)
     return run(vehicles[row], links[up], links[down], entries, frames, draws[up], truth, now_ns)
 
@@ -252,7 +256,7 @@ def _run_all(
     vehicles: Records, links: Records, entries: Records, frames: Bytes, draws: Records, truth: Records,
     waiting: Ints, now_ns: int,
 ) -> int:  # fmt: skip
-    """Run until now each plain vehicle that may have a datagram leave by now, up to an unusual event.
+    """Run until now each plain vehicle that may have a datagram leave by now, up to an event that takes Python.
 
     Returns how many vehicles are left to Python; `waiting` holds (when their next datagram can leave, row) of each.
     """

@@ -115,7 +115,7 @@ class Craft(Protocol):
     """The version that AUTOPILOT_VERSION reports."""
     is_plain: bool
     """Whether it is a double integrator whose set-points act at once, and which reports its true state. Then kernels
-    run its usual events, see `plain`."""
+    run its common events, see `plain`."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does."""
     intervals_us: Mapping[int, int]
@@ -229,7 +229,7 @@ class Shell(Generic[Flown]):
         radio.send(frame, time_ns)
 
     def _runs_plainly(self, run: Callable[..., int], time_ns: int, *heard: Any) -> bool:
-        """Run an event of a plain craft, a report or what is heard, in a kernel; False if it is unusual."""
+        """Run an event of a plain craft, a report or what is heard, in a kernel; False if it takes Python."""
         radio, (vehicles, _, row) = self.radio, self.radio.place
         arguments = vehicles, row, *heard, self._frames, radio.truth_rows
         size = run(*arguments)

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, continuous_margin, formation_loop, response_states, sampled_margin
-from gains.sampled.coupled_block import CoupledBlock, coupled_blocks, critical_block, unlike_blocks
+from gains.sampled.coupled_block import CoupledBlock, coupled_blocks, critical_block, first_of_each_kind
 from gains.sampled.multirate import Timing
 
 TREE = (-1, 0, 1, 0, 3)
@@ -24,7 +24,7 @@ def tree_blocks(period_s: float = 0.02) -> list[CoupledBlock]:
 def test_each_vehicle_of_a_tree_is_its_own_block() -> None:
     blocks = tree_blocks()
     assert sorted(block.system_ids for block in blocks) == [(1,), (2,), (3,), (4,), (5,)]
-    leader, follower = unlike_blocks(blocks)
+    leader, follower = first_of_each_kind(blocks)
     assert (leader.system_ids, follower.system_ids) == ((1,), (2,))
     assert leader.K.tolist() == [[K1, 0.0], [0.0, K1]]
     assert follower.K.tolist() == [[K3, 0.0, K1, 0.0], [0.0, K3, 0.0, K1]]
@@ -55,7 +55,7 @@ def test_blocks_of_responding_vehicles_have_the_margin_of_the_whole() -> None:
 def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
     """Margins of the continuous blocks in closed form; a period T takes half of itself away."""
     period_s = 1e-3
-    leader, follower = unlike_blocks(tree_blocks(period_s))
+    leader, follower = first_of_each_kind(tree_blocks(period_s))
     omega = sqrt((K1**2 + sqrt(K1**4 + 4.0 * K3**2)) / 2.0)
     for block, margin_s in ((leader, pi / (-2.0 * K1)), (follower, atan(-K1 * omega / K3) / omega)):
         assert block.margin_s() == pytest.approx(margin_s - period_s / 2.0, abs=1e-6)

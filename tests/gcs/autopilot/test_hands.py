@@ -33,7 +33,7 @@ class Talk:
 
     def hear(self, msg_id: int, fields: tuple[Any, ...] = (), *, flags: int = 0) -> None:
         self.vehicle.heard_ns = self.now_ns
-        self.vehicle.tell_startup(msg_id, fields or (*(0,) * 5, flags, *(0,) * 3, flags))
+        self.vehicle.pass_to_startup(msg_id, fields or (*(0,) * 5, flags, *(0,) * 3, flags))
 
     def rise(self, altitude_m: float) -> None:
         mm = round(1000.0 * altitude_m)

@@ -1,15 +1,15 @@
 """The limits that vehicles tell, and commands kept within them."""
 
 from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER
-from gcs.autopilot.vehicle_limits import ToldLimits
+from gcs.autopilot.vehicle_limits import ReportedLimits
 from gcs.link.kinds import UNRECOGNISED, Kind
 
 SECOND = 1_000_000_000
 
 
-def answered(kind: Kind, values: dict[bytes, float]) -> tuple[ToldLimits, list[bytes]]:
+def answered(kind: Kind, values: dict[bytes, float]) -> tuple[ReportedLimits, list[bytes]]:
     """The limits after ten seconds of questions, of which a vehicle answers those it knows."""
-    limits, asked = ToldLimits(), list[bytes]()
+    limits, asked = ReportedLimits(), list[bytes]()
     for k in range(500):
         due = limits.next(kind, k * SECOND // 50, target_system=1, rtt_ns=0)
         if due is not None:
@@ -47,7 +47,7 @@ def test_what_no_vehicle_can_mean_is_no_limit() -> None:
 
 
 def test_what_was_not_asked_is_not_believed() -> None:
-    limits = ToldLimits()
+    limits = ReportedLimits()
     limits.take((10.0, 3, 0, b"WPNAV_ACCEL\0", 9))
     assert limits.next(UNRECOGNISED, 0, target_system=1, rtt_ns=0) is None
     assert limits.in_words().endswith("it tells no limits")

@@ -9,7 +9,7 @@ import pytest
 
 from gains.performance.response import Response
 from gcs.control.acted import ActiveTargets
-from gcs.control.prediction import AtOnce, CommandHistory
+from gcs.control.prediction import CommandHistory, LaglessMotion
 from gcs.control.responding import Responding
 from gcs.link import mavlink
 
@@ -30,7 +30,7 @@ def active(acceleration: Vector, velocity: Vector | None = None) -> tuple[Any, .
 class Link:
     """A vehicle that takes some set-points and reports what it follows, and the station's history of it."""
 
-    def __init__(self, count: int = 20, *, responds: AtOnce | None = None) -> None:
+    def __init__(self, count: int = 20, *, responds: LaglessMotion | None = None) -> None:
         self.wanted = np.random.default_rng(1).uniform(-5.0, 5.0, (count, 2))
         self.history = CommandHistory(S, responds)
         self.targets = ActiveTargets(self.history, period_ns=PERIOD, held_ns=S)
@@ -55,8 +55,8 @@ class Link:
         return complex(*self.wanted[tick])
 
 
-@pytest.mark.parametrize("responds", [AtOnce(), Responding(Response(0.3, 0.0))])
-def test_an_altered_history_is_that_of_what_acted(responds: AtOnce) -> None:
+@pytest.mark.parametrize("responds", [LaglessMotion(), Responding(Response(0.3, 0.0))])
+def test_an_altered_history_is_that_of_what_acted(responds: LaglessMotion) -> None:
     """Without a velocity to catch up with: the sums are those of a history in which the other one was sent."""
     altered, plain = CommandHistory(S, responds), CommandHistory(S, responds)
     for k in range(30):
@@ -73,7 +73,7 @@ def test_an_altered_history_is_that_of_what_acted(responds: AtOnce) -> None:
 
 def test_a_velocity_loop_makes_up_for_what_was_lost() -> None:
     """After the next set-point it follows the same velocity target; a vehicle without such a loop does not."""
-    for responds, left in ((Responding(Response(0.15, 2.0)), 0.0), (AtOnce(), 0.3)):
+    for responds, left in ((Responding(Response(0.15, 2.0)), 0.0), (LaglessMotion(), 0.3)):
         altered, plain = CommandHistory(100 * S, responds), CommandHistory(100 * S, responds)
         for k in range(10):
             for history in (altered, plain):

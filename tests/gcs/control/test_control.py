@@ -8,7 +8,7 @@ import pytest
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gcs.control.history import HISTORY, StateHistory
-from gcs.control.law import FeedbackLaw, Moment, feedback_law, formation_control, unblended
+from gcs.control.law import FeedbackLaw, TickInputs, feedback_law, formation_control, unblended
 from gcs.control.limits import shorten
 from gcs.plan.formation import Formation
 
@@ -50,7 +50,7 @@ def controlled(
 ) -> Controlled:
     law, blends = feedback_law(TREE, K, lost), unblended(5)
     blends[:] = blend
-    controls = formation_control(history, law, blends, Moment(0, 0.0, v_d))
+    controls = formation_control(history, law, blends, TickInputs(0, 0.0, v_d))
     return Controlled(*(controls[name] for name in ("command_m_s2", "spacing_error_m", "velocity_error_m_s")))
 
 

@@ -12,7 +12,7 @@ from gcs.plan.planner import flight_plan
 from scenarios.files import load
 from scenarios.keys.link import Link, Links
 from scenarios.schema import Response
-from tests.gcs.drive.test_usual_steps import StepByStep
+from tests.gcs.drive.test_fast_path import StepByStep
 from tests.support.paths import SCENARIOS
 
 def compiled():

@@ -88,14 +88,14 @@ def test_a_stranger_is_asked_and_commanded_nothing() -> None:
     assert vehicle.startup.refusal.startswith("does not say that it is simulated, wanted")
     vehicle.goal = Goal.END
     assert vehicle.next_frame(20 * NS_PER_S) is None
-    assert vehicle.parting_command() is None
+    assert vehicle.final_command() is None
 
 
 def test_a_stranger_that_says_it_is_simulated_is_flown() -> None:
     vehicle, _ = stranger()
-    vehicle.tell_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"OTHER\0", b"0123 trio\0", 11))
+    vehicle.pass_to_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"OTHER\0", b"0123 trio\0", 11))
     assert vehicle.next_frame(20 * NS_PER_S) is None
-    vehicle.tell_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"SCENARIO\0", b"0123 trio\0", 11))
+    vehicle.pass_to_startup(mavlink.PARAM_EXT_VALUE, (0, 1, b"SCENARIO\0", b"0123 trio\0", 11))
     assert requested(vehicle.next_frame(20 * NS_PER_S)) == mavlink.LOCAL_POSITION_NED
 
 

@@ -21,7 +21,7 @@ from scenarios.keys import link as link_keys
 from scenarios.keys.link import Jitter, Links
 from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.links.links import CAPACITY, LinkSet
-from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
+from sim_vehicles.links.relay import InTransit, Relay, holds_key, sender
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, MemoryRecorder, read_truth
 from sim_vehicles.services.clock import NEVER_NS
 from tests.support.processes import free_port
@@ -48,10 +48,10 @@ def frame(system_id: int, sequence: int = 0, *, version: int = 2, component: int
     return dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 3, 3).pack(mav, force_mavlink1=version == 1)
 
 
-def through(relay: Relay, sent: Iterable[Passing], *, every_ns: int = MS) -> list[Passing]:
+def through(relay: Relay, sent: Iterable[InTransit], *, every_ns: int = MS) -> list[InTransit]:
     """What comes out when the relay is called every so often."""
     waiting = sorted(sent)
-    out: list[Passing] = []
+    out: list[InTransit] = []
     now_ns = START
     while waiting or relay.next_event_ns != NEVER_NS:
         now_ns += every_ns
@@ -72,12 +72,12 @@ def test_the_sender_is_read_from_the_header_alone() -> None:
 def test_no_datagram_makes_the_relay_stumble(data: bytes) -> None:
     assert sender(data) in {None, *range(1, 251)}
     relay = Relay(scenario(1), START)
-    assert through(relay, [Passing(START, LINK_UP, 1, data), Passing(START, LINK_DOWN, 1, data)])
+    assert through(relay, [InTransit(START, LINK_UP, 1, data), InTransit(START, LINK_DOWN, 1, data)])
 
 
 @pytest.mark.parametrize("kind", [LINK_UP, LINK_DOWN])
 def test_a_relayed_datagram_has_the_fate_of_a_simulated_one(kind: int) -> None:
-    sent = [Passing(START + k * 2 * MS, kind, 2, frame(2, k)) for k in range(500)]
+    sent = [InTransit(START + k * 2 * MS, kind, 2, frame(2, k)) for k in range(500)]
     recorder = MemoryRecorder()
     came = through(Relay(wild(), START, recorder=recorder), sent)
     alone = LinkSet(wild(), START).of(2)[kind != LINK_UP]
@@ -92,14 +92,14 @@ def test_a_relayed_datagram_has_the_fate_of_a_simulated_one(kind: int) -> None:
 
 
 def test_how_often_the_relay_is_called_changes_nothing() -> None:
-    sent = [Passing(START + k * MS, kind, 1, frame(1, k)) for k in range(200) for kind in (LINK_UP, LINK_DOWN)]
+    sent = [InTransit(START + k * MS, kind, 1, frame(1, k)) for k in range(200) for kind in (LINK_UP, LINK_DOWN)]
     rare, often = (through(Relay(wild(), START), sent, every_ns=every_ns) for every_ns in (SECOND, MS // 3))
     assert sorted(rare) == sorted(often)
 
 
 def test_a_flood_beyond_capacity_is_dropped_and_counted() -> None:
     relay = Relay(scenario(1, up_s=10.0), START)
-    came = through(relay, (Passing(START, LINK_UP, 1, frame(1, k)) for k in range(CAPACITY + 500)), every_ns=SECOND)
+    came = through(relay, (InTransit(START, LINK_UP, 1, frame(1, k)) for k in range(CAPACITY + 500)), every_ns=SECOND)
     assert len(came) == CAPACITY
     assert relay.counters["link_up_link_full"] == 500
 
@@ -110,9 +110,9 @@ def test_the_links_time_begins_with_the_stations_first_set_point() -> None:
     )
     late = scenario(1).model_copy(update={"links": Links(up=ramp, down=ramp)})
     sent = [
-        Passing(START, LINK_UP, 1, frame(1)),
-        Passing(START + 5 * SECOND, LINK_DOWN, 1, setpoint(1.0)),
-        Passing(START + 5 * SECOND + SECOND // 2, LINK_UP, 1, frame(1)),
+        InTransit(START, LINK_UP, 1, frame(1)),
+        InTransit(START + 5 * SECOND, LINK_DOWN, 1, setpoint(1.0)),
+        InTransit(START + 5 * SECOND + SECOND // 2, LINK_UP, 1, frame(1)),
     ]
     delays = [p.time_ns - s.time_ns for p, s in zip(through(Relay(late, START), sent), sent, strict=True)]
     assert delays == pytest.approx([100 * MS, 100 * MS, 200 * MS], abs=1)

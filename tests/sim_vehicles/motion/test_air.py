@@ -9,14 +9,14 @@ from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
 from scenarios.schema import Autopilot, Limits, Scenario
 from sim_vehicles.links.truth import POSITION_ERROR, PUSHED, VELOCITY_ERROR, MemoryRecorder, disturbances
 from sim_vehicles.motion import air, copter
-from sim_vehicles.motion.double_integrator import Command, State, bounds_of, push_on, state_from
+from sim_vehicles.motion.double_integrator import Command, State, bounds_of, move_under_push, state_from
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.motion.sector import AllPass, SectorBound
 from sim_vehicles.services.hot import new_vehicles
 from tests.support.sim_client import SECOND, START, scenario
 
 GUSTS = Gusts(deviation_m_s2=0.5, correlation_time_s=0.2)
-PUSH_ON_AT = at_row(push_on)
+PUSH_ON_AT = at_row(move_under_push)
 UNLIMITED = bounds_of(Limits())
 
 

@@ -1,7 +1,7 @@
-"""Usual steps: those of plain vehicles and their station in virtual time that kernels do alone, many in one call.
+"""The fast path in virtual time: steps of plain vehicles and their station that kernels do alone, many in one call.
 
-In most flights nearly all steps are usual. Where the kernel stops, for example when a vehicle answers a command or
-changes its mode, a step in Python continues from there (`gcs.drive.lockstep`).
+In most flights nearly all steps are of this kind. Where the kernel stops, for example when a vehicle answers a command
+or changes its mode, a step in Python continues from there (`gcs.drive.lockstep`).
 """
 
 from collections.abc import Generator, Sequence
@@ -11,8 +11,8 @@ import numpy as np
 
 from gcs.control.tick import TICK, TickArray
 from gcs.link.datagram import Address, Arrivals
+from gcs.station.fast_path import DONE, DUE, NOT_JUDGED, WITH_TICK, FastPathData, Sending, fast_step
 from gcs.station.station import Station
-from gcs.station.usual import DONE, DUE, NOT_JUDGED, WITH_TICK, Sending, Usual, usual_step
 from scenarios.kernel import Columns, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _NOT_YET = -1
 NOT_LEFT, PAUSED = -1, -2
-"""Progress of a call, in addition to the codes of `usual_step`. NOT_LEFT: Python must finish the vehicles' part of the
+"""Progress of a call, in addition to the codes of `fast_step`. NOT_LEFT: Python must finish the vehicles' part of the
 step. PAUSED: the steps are complete, but Python must take the rows and datagrams."""
 _STEPS = 4
 """Number of steps whose datagrams the buffers hold."""
@@ -46,7 +46,7 @@ _WIRE = np.dtype(
 )  # fmt: skip
 
 
-class Wire(NamedTuple):
+class LinkBuffers(NamedTuple):
     """Buffers shared by both ends of the links."""
 
     state: Records
@@ -69,12 +69,12 @@ class Ends(NamedTuple):
     """The arrays that a step works on: both ends of the links, and the buffers between them."""
 
     fleet: FleetArrays
-    usual: Usual
+    data: FastPathData
     places: Ints
     """The row in the fleet of each of the station's vehicles."""
     senders: Ints
     """The result of `Reception.numbered` for the fleet's vehicles."""
-    wire: Wire
+    wire: LinkBuffers
 
 
 class Stopped(NamedTuple):
@@ -85,8 +85,8 @@ class Stopped(NamedTuple):
     taken: int
 
 
-class UsualSteps:
-    """Flies the usual steps of a station and a fleet, whose vehicles have these `addresses`. For `places` see `Ends`.
+class FastPath:
+    """Flies the fast steps of a station and a fleet, whose vehicles have these `addresses`. For `places` see `Ends`.
 
     With `ahead`, several ticks are flown before their rows are yielded, and received frames are not passed on.
     """
@@ -100,7 +100,7 @@ class UsualSteps:
         arrived, sent = np.zeros((2, most * FRAME_BYTES), np.uint8)
         arrivals, to = np.zeros((2, 4, most), np.int64)
         ticks = max(1, min(_MOST_TICKS, _MOST_ROWS // n)) if ahead else 1
-        self._wire = Wire(
+        self._wire = LinkBuffers(
             np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(most, np.int64), np.zeros(ticks, DUE),
             np.empty(ticks * n, TICK),
         )  # fmt: skip
@@ -110,7 +110,7 @@ class UsualSteps:
         self._handle: Handle | None = None
 
     def fly(self, entering: Datagrams) -> Generator[TickArray, None, Stopped]:
-        """Do steps and yield the rows of their control ticks; returns the first step that is not usual.
+        """Do steps and yield the rows of their control ticks; returns the first step that needs Python.
 
         `entering` holds the datagrams that the station has sent.
         """
@@ -122,11 +122,11 @@ class UsualSteps:
             return Stopped(now_ns, self._fleet.step(entering, now_ns), 0)
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
-        usual, senders = station.usual, station.senders(self._addresses)
+        data, senders = station.fast_path_data, station.senders(self._addresses)
         arrived, ticks, most, left = state["arrived"], state["ticks"], min(_FIRST_TICKS, self._most_ticks), _NOT_YET
         while True:
             self._fleet.make_ready()
-            ends = Ends(self._fleet.arrays, usual, self._places, senders, wire)
+            ends = Ends(self._fleet.arrays, data, self._places, senders, wire)
             if self._handle is None or not _same(ends, self._handle.kept):
                 self._handle = handle(ends)
             how_far = _fly(self._handle, station.look_ahead(wire.due, most), self._room, self._ahead, left)
@@ -181,7 +181,7 @@ def _same(one: Any, other: Any) -> bool:
 
 @array_kernel
 def _fly(ends: Any, known: int, room: int, ahead: bool, left: int) -> int:
-    """Do steps while they are usual, up to the last of the `known` ticks; returns the code of the progress made.
+    """Do steps while they need no Python, up to the last of the `known` ticks; returns the code of the progress made.
 
     `ends` is a handle on `Ends`. While at most `room` datagrams have arrived, those of one more step fit into the
     buffer; with `ahead`, those of earlier steps are discarded. The vehicles' part of the first step is done if `left`,
@@ -207,8 +207,8 @@ def _fly(ends: Any, known: int, room: int, ahead: bool, left: int) -> int:
 
 @array_kernel
 def _step(ends: Any, known: int, leaving: int) -> int:
-    """Do one step as far as it is usual; returns the code of the progress made. For `leaving` see `left` of `_fly`."""
-    fleet, usual, places, senders, wire = ends.arrays
+    """Do one step as far as it needs no Python; returns its progress as a code. For `leaving` see `left` of `_fly`."""
+    fleet, data, places, senders, wire = ends.arrays
     state, n = wire.state[0], len(places)
     now_ns, ticks = state.now_ns, state.ticks
     if leaving == _NOT_YET:
@@ -220,24 +220,24 @@ def _step(ends: Any, known: int, leaving: int) -> int:
         if entered < state.sent or waiting or leaving == fleet.leaving.shape[1] or not can_record(fleet.truth):
             state.entered, state.waiting, state.leaving = entered, waiting, leaving
             return NOT_LEFT
-    usual.schedule[0].now_ns = now_ns
+    data.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
     due = wire.due[min(ticks, len(wire.due) - 1)]
-    how_far, state.taken, first, second, third = usual_step(
-        usual, wire.arrived, table, wire.none_queued[:leaving], senders, due, ticks < known,
+    how_far, state.taken, first, second, third = fast_step(
+        data, wire.arrived, table, wire.none_queued[:leaving], senders, due, ticks < known,
         wire.rows[ticks * n : (ticks + 1) * n],
     )  # fmt: skip
     state.sent = state.sent_bytes = 0
     _send(wire, first, places, now_ns)
     _send(wire, second, places, now_ns)
     _send(wire, third, places, now_ns)
-    schedule = usual.schedule[0]
+    schedule = data.schedule[0]
     state.next_ns = min(schedule.next_tick_ns, schedule.next_heartbeat_ns, schedule.next_requests_ns)
     return how_far
 
 
 @array_kernel
-def _arrive(wire: Wire, leaving: Ints, data: Bytes, count: int) -> Ints:
+def _arrive(wire: LinkBuffers, leaving: Ints, data: Bytes, count: int) -> Ints:
     """Add `count` datagrams that leave the links to the arrivals, in order of time and row; returns their table."""
     state, order = wire.state[0], np.argsort(leaving[3, :count], kind="mergesort")
     before, size = state.arrived_bytes, leaving[1, count - 1] if count else 0
@@ -252,7 +252,7 @@ def _arrive(wire: Wire, leaving: Ints, data: Bytes, count: int) -> Ints:
 
 
 @kernel
-def _send(wire: Wire, sending: Sending, places: Ints, now_ns: int) -> None:
+def _send(wire: LinkBuffers, sending: Sending, places: Ints, now_ns: int) -> None:
     """Add frames to the datagrams that enter the links in the next step."""
     state = wire.state[0]
     for k in range(len(sending.rows)):

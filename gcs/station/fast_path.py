@@ -1,9 +1,9 @@
-"""The fast path of a station: the usual step and the usual tick, one kernel each, in which nothing needs Python.
+"""The fast path of a station: a step and a control tick in one kernel each, if nothing in them needs Python.
 
-Usual are the common datagrams of `gcs.station.reception`, requests and heartbeats, and a control tick of a formation
-whose loop the station closes without prediction: in flight, if every vehicle is heard, guided and at ease; before and
-after the flight, while the station only waits for answers. These steps call the same kernels as the steps in Python,
-which take over wherever these stop.
+It takes the common datagrams of `gcs.station.reception`, sends requests and heartbeats, and does a control tick of a
+formation whose loop the station closes without prediction: in flight, if every vehicle is heard, guided and nominal;
+before and after the flight, while the station only waits for answers. These steps call the same kernels as the steps in
+Python, which take over wherever these stop.
 """
 
 from math import inf, isfinite, isnan
@@ -32,7 +32,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.station.breakage import SURELY_WITHIN
 from gcs.station.modes import Policy
 from gcs.station.monitor import Seen, Watched, judge, settle
-from gcs.station.reception import ANSWER, NEWS_OF_A_FRAME, Now, Tables, take_fresh, take_usual
+from gcs.station.reception import ANSWER, NEWS_OF_A_FRAME, Now, Tables, take_common, take_fresh
 from gcs.station.tick_rows import Judged, fill
 from scenarios.kernel import Array, Record, Records, array_kernel, kernel
 from scenarios.schema import NS_PER_S
@@ -85,7 +85,7 @@ class Sending(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Buffers for the results of a usual tick for n vehicles."""
+    """Buffers for the results of a fast tick for n vehicles."""
 
     controls: Records
     """Of `gcs.control.law.CONTROL`."""
@@ -102,8 +102,8 @@ def new_scratch(n: int) -> Scratch:
     return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_), nothing)
 
 
-class Usual(NamedTuple):
-    """All data of n vehicles on which usual steps work."""
+class FastPathData(NamedTuple):
+    """All data of n vehicles on which fast steps work."""
 
     schedule: Records
     """Of SCHEDULE, (1,)."""
@@ -131,31 +131,38 @@ does the tick if the clock of the vehicle in `clock_row` has become known; -1 fo
 
 
 @array_kernel
-def usual_step(
-    usual: Usual, stream: Bytes, table: Ints, queued_ns: Ints, senders: Ints, due: Record, known: bool, rows: Records
+def fast_step(
+    data: FastPathData,
+    stream: Bytes,
+    table: Ints,
+    queued_ns: Ints,
+    senders: Ints,
+    due: Record,
+    known: bool,
+    rows: Records,
 ) -> tuple[int, int, Sending, Sending, Sending]:
-    """Do the usual part of a step at the schedule's `now_ns`.
+    """Do a step, or as much of it as needs no Python, at the schedule's `now_ns`.
 
     Stream, table and `queued_ns` are those of `Arrivals`. Returns the outcome, how many datagrams were processed, and
     the frames to send, in order. `due`, of DUE, is the next tick. `known`: Python has filled it in and allows a kernel
     to do that tick. `rows` receives the rows of the tick.
     """
-    schedule, tables = usual.schedule[0], usual.tables
-    nothing, taken = usual.scratch.nothing, 0
+    schedule, tables = data.schedule[0], data.tables
+    nothing, taken = data.scratch.nothing, 0
     if NEWS_OF_A_FRAME * table.shape[1] > len(tables.news):
         return NOT_TAKEN, taken, nothing, nothing, nothing
     now = Now(schedule.now_ns, schedule.start_ns, schedule.period_ns, False)
-    taken = take_usual(tables, stream, table, queued_ns, 0, usual.row_of, senders, now)
+    taken = take_common(tables, stream, table, queued_ns, 0, data.row_of, senders, now)
     if taken < table.shape[1]:
         return NOT_TAKEN, taken, nothing, nothing, nothing
     for place in range(tables.news_count[0]):
         if tables.news[place].kind != ANSWER:
             return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
-        if not known or schedule.now_ns > schedule.next_tick_ns or not _is_calm(usual, due):
+        if not known or schedule.now_ns > schedule.next_tick_ns or not _is_calm(data, due):
             return NOT_DONE, taken, nothing, nothing, nothing
         answers = _answered(tables, nothing)
-        set_points, judged = _tick(usual, due, rows)
+        set_points, judged = _tick(data, due, rows)
         return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
     answers = _answered(tables, nothing)
     heartbeats = requests = nothing
@@ -163,10 +170,10 @@ def usual_step(
     if schedule.now_ns >= schedule.next_heartbeat_ns:
         schedule.next_heartbeat_ns = schedule.now_ns + HEARTBEAT_NS
         to = heard(links, np.ones(len(links), np.bool_))
-        frames = same_frames(usual.heartbeat, HEARTBEAT_EXTRA, to, links.sequence)
+        frames = same_frames(data.heartbeat, HEARTBEAT_EXTRA, to, links.sequence)
         heartbeats = Sending(frames, np.full(len(to), frames.shape[1]), to)
     if schedule.now_ns >= schedule.next_requests_ns:
-        frames, sizes, to = requested(usual.schedule, links, tables.clocks, tables.pending_ns)
+        frames, sizes, to = requested(data.schedule, links, tables.clocks, tables.pending_ns)
         requests = Sending(frames, sizes, to)
     return DONE, taken, answers, heartbeats, requests
 
@@ -204,51 +211,51 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 
 @kernel
-def _is_calm(usual: Usual, due: Record) -> bool:
+def _is_calm(data: FastPathData, due: Record) -> bool:
     """Whether the monitor only has to record delays and times; if so, it records them."""
-    limits, silent, judged = usual.limits, usual.scratch.silent, usual.watched.judged[0]
-    if due.clock_row >= 0 and usual.tables.clocks[due.clock_row].samples >= LEAST_SAMPLES:
+    limits, silent, judged = data.limits, data.scratch.silent, data.watched.judged[0]
+    if due.clock_row >= 0 and data.tables.clocks[due.clock_row].samples >= LEAST_SAMPLES:
         return False
     for row in range(len(silent)):
-        silent[row] = usual.schedule[0].now_ns - usual.tables.telemetry_ns[row] > limits.silence_ns
-    seen = Seen(due.time_s, due.flying, silent, usual.guided, usual.critical, usual.used_s)
-    if judge(usual.watched, seen, usual.policy, limits.separable) > 0:
-        usual.watched.judged[0] = judged
+        silent[row] = data.schedule[0].now_ns - data.tables.telemetry_ns[row] > limits.silence_ns
+    seen = Seen(due.time_s, due.flying, silent, data.guided, data.critical, data.used_s)
+    if judge(data.watched, seen, data.policy, limits.separable) > 0:
+        data.watched.judged[0] = judged
         return False
-    settle(usual.watched)
+    settle(data.watched)
     return True
 
 
 @array_kernel
-def usual_set_points(usual: Usual, due: Records) -> tuple[bool, Sending]:
-    """Make the set-points of the tick due now, DUE (1,). If it is not usual, nothing is done and False is returned."""
-    if not _is_calm(usual, due[0]):
-        return False, usual.scratch.nothing
-    set_points, _ = _command(usual, due[0])
+def fast_set_points(data: FastPathData, due: Records) -> tuple[bool, Sending]:
+    """Make the set-points of the tick due now, DUE (1,). If it needs Python, nothing is done and False is returned."""
+    if not _is_calm(data, due[0]):
+        return False, data.scratch.nothing
+    set_points, _ = _command(data, due[0])
     return True, set_points
 
 
 @array_kernel
-def _command(usual: Usual, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
+def _command(data: FastPathData, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
     """The set-points of the tick due now, and which vehicles follow the control law."""
-    schedule, limits, tables, law = usual.schedule[0], usual.limits, usual.tables, usual.law
-    controls, points, due_ns = usual.scratch.controls, usual.scratch.points, schedule.next_tick_ns
+    schedule, limits, tables, law = data.schedule[0], data.limits, data.tables, data.law
+    controls, points, due_ns = data.scratch.controls, data.scratch.points, schedule.next_tick_ns
     ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ticks are skipped
     schedule.next_tick_ns = due_ns + ticks * schedule.period_ns
     schedule.tick_count += ticks
     times_ns, states = every_newest(tables.reports, tables.report_counts)
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
     north_m_s, east_m_s = due.velocity_ne_m_s
-    control_all(controls, law, times_ns, states, seen, usual.blends, north_m_s, east_m_s, 1.0)
+    control_all(controls, law, times_ns, states, seen, data.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    followed = commanded(controls, usual.watched.states.released, due.flying)
+    followed = commanded(controls, data.watched.states.released, due.flying)
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
-    frames = set_point_frames(points, to, tables.links.sequence, usual.targets, _key_ms(schedule, due_ns))
+    frames = set_point_frames(points, to, tables.links.sequence, data.targets, _key_ms(schedule, due_ns))
     rtt_s = take_fresh(tables.fresh_ns, tables.fresh_counts)
     for row in range(len(rtt_s)):
-        usual.scratch.rtt_s[row] = rtt_s[row]
+        data.scratch.rtt_s[row] = rtt_s[row]
     return Sending(frames, np.full(len(to), frames.shape[1]), to), followed
 
 
@@ -259,12 +266,12 @@ def _key_ms(schedule: Record, due_ns: int) -> int:
 
 
 @array_kernel
-def _tick(usual: Usual, due: Record, rows: Records) -> tuple[Sending, bool]:
+def _tick(data: FastPathData, due: Record, rows: Records) -> tuple[Sending, bool]:
     """Do the tick due now. Returns its set-points, and False if `rows` are not filled: the formation may be broken."""
-    schedule, limits, tables, controls = usual.schedule[0], usual.limits, usual.tables, usual.scratch.controls
+    schedule, limits, tables, controls = data.schedule[0], data.limits, data.tables, data.scratch.controls
     due_ns, number = schedule.next_tick_ns, schedule.tick_count
-    set_points, followed = _command(usual, due)
-    repeated = repeated_s(usual.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
+    set_points, followed = _command(data, due)
+    repeated = repeated_s(data.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
     down_m = np.empty(len(controls) if limits.has_slots else 0)
     for row in range(len(down_m)):
         down_m[row] = tables.reported[row].down_m
@@ -274,14 +281,14 @@ def _tick(usual: Usual, due: Record, rows: Records) -> tuple[Sending, bool]:
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
     if due.flying and (closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)):
         return set_points, False
-    states = usual.watched.states
+    states = data.watched.states
     judged = Judged(
-        usual.system_ids, states.mode, states.gain_set, controls, tables.reported, usual.scratch.rtt_s, followed,
-        usual.shorter_s, usual.watched.margins_s, repeated,
+        data.system_ids, states.mode, states.gain_set, controls, tables.reported, data.scratch.rtt_s, followed,
+        data.shorter_s, data.watched.margins_s, repeated,
     )  # fmt: skip
     sent_ns = np.full(len(controls), due_ns)
     fill(
-        rows, usual.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
+        rows, data.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
         number, due.time_s, due_ns, _key_ms(schedule, due_ns),
     )  # fmt: skip
     return set_points, True

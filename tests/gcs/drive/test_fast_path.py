@@ -40,8 +40,8 @@ class Counting(Station):
     steps, plainly = 0, False
 
     @property
-    def is_usual(self) -> bool:
-        return super().is_usual and not self.plainly
+    def has_fast_path(self) -> bool:
+        return super().has_fast_path and not self.plainly
 
     def step(self, datagrams: Any, now_ns: int, taken: int = 0) -> Any:
         self.steps += 1
