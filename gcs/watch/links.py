@@ -45,7 +45,7 @@ _GAP_NS = round(SILENCE_S * NS_PER_S)
 """A longer gap between two states is a silence: the vehicle would be lost in flight, and get no set-points."""
 SAMPLE_NS = NS_PER_S // 10
 """Mean time between two looks, each of which records the age of the newest states."""
-PAST = "past the margin"
+PAST = "p99 past the margin"
 LOWER_BOUND = "lower bound"
 """Status of a delay measured against the fastest frame for lack of an exchange."""
 _GOLDEN = 0.6180339887498949

@@ -45,8 +45,8 @@ from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, tak
 from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
 
 NEEDS_PYTHON, MOVE_FIRST, SILENT = -2, -1, 0
-"""Returned in place of a frame's size. NEEDS_PYTHON, MOVE_FIRST: nothing was done; the event takes Python, or the craft must
-move first. SILENT: done, with no frame to send."""
+"""Returned in place of a frame's size. NEEDS_PYTHON, MOVE_FIRST: nothing was done; the event takes Python, or the
+craft must move first. SILENT: done, with no frame to send."""
 _SETPOINT_BYTES, _HEARTBEAT_BYTES = 53, 9
 """Sizes of complete payloads: common set-points and heartbeats do not end in zeros."""
 

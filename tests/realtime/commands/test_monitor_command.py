@@ -81,7 +81,7 @@ def test_ctrl_c_prints_the_figures_and_what_was_sent() -> None:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, err) == (130, "")
-    assert "3 vehicles: past the margin" in first
+    assert "3 vehicles: p99 past the margin" in first
     assert out.count("past the margin") == 3
     assert "TIMESYNC requests, nothing else" in out
 
