@@ -6,15 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs.control.phases import Phase
 from gcs.control.tick import Mode
 from gcs.drive.lockstep import START_NS
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import verdict
 from gcs.station.absence import LEFT_OUT
+from gcs.station.station import Station
 from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.left_out import without
 from scenarios.schema import NominalVelocity, Scenario
 from tests.support.fleets.flown_copters import TRUTH, Flight, fly, plan_for, three
+from tests.support.station_peer import Peer
 
 DEAD = Link(loss_probability=1.0)
 
@@ -125,3 +128,13 @@ def test_copters_stop_in_flight_and_fly_on() -> None:
     for at_s, speed in ((14.0, 0.0), (24.0, 4.0)):
         rows = flight.flown[np.abs(flight.flown["time_s"] - at_s) < 0.011]
         assert rows["velocity_north_m_s"].tolist() == pytest.approx([speed] * len(rows), abs=0.1)
+
+
+def test_patience_does_not_count_what_waited_in_the_socket_before_the_start() -> None:
+    station = Station(plan_for(lacking(3, patience_s=8.0)), start_ns=START_NS)
+    peers = [Peer(k, ("127.0.0.1", 5000 + k, 0)) for k in (1, 2, 3)]
+    waited = [peer.heartbeat(START_NS - before_ns) for before_ns in (30_000_000_000, 1_000_000) for peer in peers]
+    for step in range(10):
+        station.step(waited if step == 0 else [], station.next_event_ns)
+    assert [event.text for event in station.events] == ["found"] * 3
+    assert station.phase is Phase.CONNECTING
