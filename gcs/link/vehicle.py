@@ -58,7 +58,6 @@ SILENCE_S = 1.5
 """A vehicle without telemetry for this long is lost: it gets no more set-points, and the others fly without it. One
 that sends nothing at all for this long may come back from another address."""
 _MAVLINK_1 = "speaks MAVLink 1, wanted MAVLink 2; on an ArduPilot, set SERIALn_PROTOCOL to 2"
-_LONG_AGO_NS = -(1 << 62)
 _SILENT_NS = 3 * NS_PER_S
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
 
@@ -260,10 +259,6 @@ class RemoteVehicle:
         """When the first heartbeat after a long silence arrived. Its sequence number does not reveal a replay."""
         self.speaks_mavlink_1 = False
         """Whether its last message of which MAVLink 2 is expected was MAVLink 1."""
-        self.doubled = ""
-        """That a second address sends heartbeats with its system id, in words; empty if none does."""
-        self._rival_ns = _LONG_AGO_NS, _LONG_AGO_NS
-        """When the first and the newest heartbeat from such an address arrived."""
         self._land = land
         self._now_ns = 0
         self._report = report
@@ -364,12 +359,7 @@ class RemoteVehicle:
             left = "left" if self.has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         missing = self._next_step().missing
-        return self.doubled or (_MAVLINK_1 if missing and self.speaks_mavlink_1 else missing)
-
-    @property
-    def refusal(self) -> str:
-        """Why the vehicle must not be flown; empty if it may."""
-        return self.doubled or self.startup.refusal
+        return _MAVLINK_1 if missing and self.speaks_mavlink_1 else missing
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:
         """A frame to this vehicle, with sequence numbers of its own, by which the vehicle can count losses."""
@@ -388,21 +378,6 @@ class RemoteVehicle:
     def accepts_address(self, address: Address, msg_id: int, received_ns: int) -> bool:
         """Whether a frame from a new address may be from this vehicle: only a heartbeat, at first or after silence."""
         return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
-
-    def note_rival(self, address: Address, received_ns: int) -> None:
-        """Note a heartbeat of an autopilot with its system id from an address that is not its own.
-
-        One that has moved falls silent at its old address; until that is clear, it is commanded nothing.
-        """
-        first_ns, newest_ns = self._rival_ns
-        self._rival_ns = first_ns if received_ns - newest_ns < _SILENT_NS else received_ns, received_ns
-        if self.address and not self.doubled and self.heard_ns - self._rival_ns[0] > SILENCE_S * NS_PER_S:
-            (host, port, _), (other_host, other_port, _) = self.address, address
-            self.doubled = (
-                f"is heard from {host}:{port} and {other_host}:{other_port}, wanted one address: two vehicles with one "
-                "system id, or one vehicle over two links"
-            )
-            self._report("vehicle", self.doubled, self.system_id)
 
     def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:
         """Whether a frame was received before, or is a heartbeat that a newer frame has overtaken.
@@ -623,8 +598,7 @@ class RemoteVehicle:
         if self.goal is Goal.END:
             return None if self.ended else mode_command(self.kind, self.end_mode)
         command = self._next_step().command
-        left_alone = self.taken_over or self._now_ns - self._rival_ns[1] < _SILENT_NS
-        return command if command is None or not left_alone or command[0] == SET_MESSAGE_INTERVAL else None
+        return command if command is None or not self.taken_over or command[0] == SET_MESSAGE_INTERVAL else None
 
     def _next_step(self) -> Step:
         """The next step of the start-up. Mode and arming of a vehicle flown by somebody else are left to its pilot."""
@@ -663,4 +637,4 @@ def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:
 
 def refusals(vehicles: Sequence[RemoteVehicle]) -> str:
     """Which vehicles must not be flown, and why; empty if all may."""
-    return in_words("refused: ", [vehicle for vehicle in vehicles if vehicle.refusal])
+    return in_words("refused: ", [vehicle for vehicle in vehicles if vehicle.startup.refusal])

@@ -206,9 +206,6 @@ class Reception:
             if vehicle.address != datagram.address:
                 if not vehicle.accepts_address(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
-                    if frame.msg_id == HEARTBEAT:
-                        vehicle.note_rival(datagram.address, datagram.received_ns)
-                        self.touched.add(row)
                     continue
                 vehicle.address = datagram.address
                 self._report("vehicle", "found", vehicle.system_id)

@@ -145,39 +145,6 @@ def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     assert station.vehicles[1].address == thief.address
 
 
-def test_two_vehicles_with_one_system_id_are_refused_and_neither_is_armed() -> None:
-    station, pair = Station(PLAN, start_ns=S), [Peer(2), Peer(2, ("127.0.0.1", 6666, 0))]
-    sent: list[tuple[int, int]] = []
-    for k in range(200):
-        now_ns = S + 20 * MS * k
-        said = [peer.heartbeat(now_ns) for own, peer in enumerate(pair) if k % 50 == own]
-        said += [pair[0].datagram(pair[0].link.command_ack_encode(command, 0), now_ns) for command, _ in sent[-1:]]
-        outgoing, _ = station.step(said, now_ns)
-        sent += commands(outgoing)
-        assert not [own for own in messages(outgoing, "COMMAND_LONG") if own.command == 176 and own.param2 == 4.0]
-    assert {command for command, _ in sent} == {511, 176}  # a rate, before the second was heard, and to hold at the end
-    why = "is heard from 127.0.0.1:5001 and 127.0.0.1:6666, wanted one address: two vehicles with one system id, or one"
-    assert [event.text for event in station.events if event.kind == "vehicle"] == [
-        "found",
-        f"{why} vehicle over two links",
-    ]
-    assert station.end_reason.startswith(f"refused: vehicle 2 {why}")
-
-
-def test_a_vehicle_that_moves_to_another_address_is_no_second_vehicle() -> None:
-    """What it sent before arrives for another second."""
-    station, peer, moved = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666, 0))
-    for k in range(20):
-        now_ns = S + 200 * MS * k
-        station.step([peer.heartbeat(now_ns)], now_ns)
-    for k in range(20, 40):
-        now_ns = S + 200 * MS * k
-        late = [peer.heartbeat(now_ns)] if k < 25 else []
-        station.step([*late, moved.heartbeat(now_ns + MS)], now_ns + 2 * MS)
-    assert station.vehicles[1].address == moved.address
-    assert not station.vehicles[1].refusal
-
-
 def test_a_vehicle_that_speaks_mavlink_1_is_named_as_such_until_it_speaks_mavlink_2() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = station.vehicles[1]
