@@ -50,9 +50,9 @@ _SOLVED = 1e-15
 def block_delay_margin(plant: SampledPlant) -> float:
     """The least delay tau (s) at which the block loses stability; 0 if unstable without delay, `inf` if never.
 
-    `inf` means that no root crosses at the fractions m of a period that are looked at: either no locus of H_m has modulus
-    one, so no delay is too long, or no crossing lies within 40 turns of a locus. Fractions in between are not looked at,
-    and with several inputs the angles come from a sweep over frequencies.
+    `inf` means that no root crosses at the fractions m of a period that are looked at: either no locus of H_m has
+    modulus one, so no delay is too long, or no crossing lies within 40 turns of a locus. Fractions in between are not
+    looked at, and with several inputs the angles come from a sweep over frequencies.
 
     Cached for each plant: designs, margins over links and loops of single vehicles all need it.
 

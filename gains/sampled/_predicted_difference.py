@@ -190,7 +190,7 @@ class PredictedDifference:
 
         1 if det(I - N) is 0 to rounding at some angle: the loop is not asymptotically stable, as far as can be known.
         """
-        # nan / nan is computed apart from the usual warning
+        # a product, because dividing by nan would warn
         turned = [np.angle(values[1:] * values[:-1].conj()).sum() for _, values in self.resolved(np.array(delays_s))]
         last = self.grid.angle[-1:].repeat(len(delays_s))
         if last[0] < pi:  # from there to pi the eigenvalues of I - N stay in the right half plane

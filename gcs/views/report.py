@@ -76,8 +76,8 @@ def print_design(design: Design, console: Console | None = None) -> None:
         console.print(f"link     {measured}; wanted headroom {link.headroom:.0%} at the worst")
         console.print(f"         chosen {link.chosen}")
         if link.lost_share > _LOSSY:
-            hides = "as many set-points may be, and the previous one then acts on, which these delays do not show"
-            console.print(f"losses   {link.lost_share:.0%} of a vehicle's datagrams were lost: {hides}")
+            hides = "if set-points are lost as often, the previous one stays in force longer than these delays show"
+            console.print(f"losses   {link.lost_share:.0%} of a vehicle's datagrams were lost; {hides}")
     if design.criteria is not None:
         _print_criteria(design.criteria, console)
     if design.trade_off:
