@@ -43,7 +43,6 @@ def handle(arrays: Any) -> Handle:
 
 @array_kernel
 def _handle(arrays: Any) -> Any:
-    """The compiled code cached on disk names the tuples' classes. If one is renamed, this file has to change, too."""
     return Handle(_borrowed(arrays))
 
 

@@ -92,6 +92,8 @@ class _Kernel:
         import numba
         from numba.core import config
 
+        from scenarios import kernel_cache
+
         settings: Any = config
         compiler: Any = numba
         folder, before = _cache(settings.CACHE_DIR), (settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES)
@@ -99,16 +101,16 @@ class _Kernel:
         settings.CACHE_DIR = (
             ""
             if folder is None
-            else str(folder / f"{self._stamp}-{settings.BOUNDSCHECK}{self._makes_arrays:d}{for_python:d}")
+            else str(folder / f"{self._stamp}={settings.BOUNDSCHECK}{self._makes_arrays:d}{for_python:d}")
         )
         settings.CACHE_LOCATOR_CLASSES = "scenarios.kernel_cache.AnyClone"
         try:
-            return compiler.njit(
-                cache=folder is not None,
-                _nrt=self._makes_arrays,
-                no_cfunc_wrapper=True,
-                no_cpython_wrapper=not for_python,
-            )(self._function)
+            compiled = compiler.njit(_nrt=self._makes_arrays, no_cfunc_wrapper=True, no_cpython_wrapper=not for_python)(
+                self._function
+            )
+            if folder is not None:
+                compiled._cache = kernel_cache.KernelCache(self._function)
+            return compiled
         finally:
             settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
 

@@ -1,10 +1,10 @@
-"""The first call of a kernel, for `scenarios/kernel.py`: where Numba caches, and that no signal breaks into it."""
+"""The first call of a kernel, for `scenarios/kernel.py`: how Numba caches it, and that no signal breaks into it."""
 
 import signal
 from typing import Any
 
-from numba.core import event
-from numba.core.caching import UserProvidedCacheLocator
+from numba.core import event, types
+from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 
 class AnyClone(UserProvidedCacheLocator):
@@ -13,6 +13,26 @@ class AnyClone(UserProvidedCacheLocator):
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:  # noqa: ARG003
         return ""
+
+
+class KernelCache(FunctionCache):
+    """Numba's cache for a function, with an index that names the fields of tuples.
+
+    Compiled code knows them by their order, which may have changed since. And no class is looked up that has gone.
+    """
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        return (*map(_described, sig), *super()._index_key(sig, codegen)[1:])
+
+
+def _described(kind: Any) -> str:
+    """A type's name; of a named tuple, also its fields, and of a handle, those of its tuple."""
+    if isinstance(kind, types.StructRef):
+        return f"{kind} {[*map(_described, kind.field_dict.values())]}"
+    if isinstance(kind, types.BaseTuple):
+        inner: Any = kind
+        return f"{kind} {getattr(kind, 'fields', '')} {[*map(_described, inner.types)]}"
+    return str(kind)
 
 
 class _Uninterrupted(event.Listener):

@@ -4,6 +4,7 @@ import gc
 import os
 import pkgutil
 import signal
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -66,7 +67,7 @@ def test_a_kernel_that_would_lose_arrays_is_found(caller: Any, lost: int) -> Non
 
 
 def loaded(file: Path) -> Any:
-    spec = spec_from_file_location("square", file)
+    spec = spec_from_file_location(file.stem, file)
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
@@ -90,6 +91,30 @@ def test_what_one_copy_of_the_source_compiled_no_other_compiles(
         assert square(3) == 9 + (name == "changed")
         known.append(sum(square._compiled.stats.cache_hits.values()))
     assert known == [0, 1, 0]
+
+
+@pytest.mark.parametrize(
+    "changed", [("Pair", "y: int", "x: int"), ("Renamed", "x: int", "y: int")], ids=["reordered", "renamed"]
+)
+def test_a_tuple_that_changed_elsewhere_is_compiled_for_anew(
+    changed: tuple[str, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel's file says nothing of the tuple, and the class that was cached is gone, as after an update."""
+    from numba.core import config
+
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    kernels = tmp_path / "difference.py"
+    kernels.write_text(
+        "from scenarios.kernel import kernel\n\n\n@kernel\ndef difference(of):\n    return of.x - of.y\n"
+    )
+    pairs = tmp_path / "pairs_of_numbers.py"
+    for name, *fields in (("Pair", "x: int", "y: int"), changed):
+        lines = ["from typing import NamedTuple", f"class {name}(NamedTuple):", *(f"    {field}" for field in fields)]
+        pairs.write_text("\n".join(lines))
+        module = loaded(pairs)
+        monkeypatch.setitem(sys.modules, pairs.stem, module)
+        pair = getattr(module, name)(x=5, y=3)
+        assert loaded(kernels).difference(pair) == 2
 
 
 def test_a_signal_waits_until_a_kernel_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
