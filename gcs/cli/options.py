@@ -291,12 +291,12 @@ def refuse_alone(option: str, value: object, needed: str, *given: object) -> Non
         raise InputError(f"read {option} without {needed}, wanted it with {needed}")
 
 
-def unmet_headroom(found: float | None, least: float) -> str:
-    """The message for an --assert-headroom that does not hold; empty if the headroom found is enough."""
+def unmet_headroom(found: float | None, least: float, of: str = "") -> str:
+    """The message for an --assert-headroom that does not hold; empty if the headroom found, `of` these, is enough."""
     if found is not None and found >= least:
         return ""
     read = "no headroom" if found is None else beyond(100.0 * found, 100.0 * least, 1) + "%"
-    return f"--assert-headroom: read {read}, wanted at least {100.0 * least:g}%"
+    return f"--assert-headroom: read {read}{of}, wanted at least {100.0 * least:g}%"
 
 
 def say_failed(failure: str) -> None:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from gains.core.arrays import FloatArray
 from gcs.control.loop_delay import headroom
+from gcs.drive.channels import over_channels
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
 from gcs.plan.expected_delay import (
@@ -88,7 +89,11 @@ class ScenarioCheck(Published):
     effective_headroom: float | None
     """That vehicle's headroom at that delay."""
     channels_not_included: bool
-    """Whether datagrams queue for limited bandwidth; the expected loop delay does not include that wait."""
+    """Whether next to nothing reaches a vehicle over a channel of limited bandwidth. Its figures are then without the
+    channel, except that its effective loop delay is unknown."""
+    channel_use: dict[str, float]
+    """By the name of a channel: the time that it needs for all datagrams of a flight, as a share of the flight. Above
+    1, it drops datagrams. Of the channels of one name, the fullest counts."""
     outage_s: float | None
     """The longest link outage during the flight, which no figure here includes; None without outages."""
     setpoint_gaps: float
@@ -125,12 +130,6 @@ class ScenarioCheck(Published):
     code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
     """The code that would run: the file by the scenario key that names it."""
 
-    @property
-    def least_headroom(self) -> float | None:
-        """The lesser of `headroom_p99` and `effective_headroom`; None if either is, as when next to nothing arrives."""
-        found = self.headroom_p99, self.effective_headroom
-        return None if None in found else min(own for own in found if own is not None)
-
 
 def check(plan: FlightPlan) -> ScenarioCheck:
     """Check a plan: its vehicles at the start, and the headroom over the scenario's links."""
@@ -146,8 +145,9 @@ def check(plan: FlightPlan) -> ScenarioCheck:
             apart = np.array(ahead.position_ne_m) - vehicle.position_ne_m
             errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
     commands = plan.gain @ errors
-    limits, delays_s = scenario.limits, planned_loop_delays_s(plan)
-    left_s = link_delays_left_s(plan) if scenario.control.prediction != "measured" else dict[int, float]()
+    delays_s, effective_s, drawn, use = _delays(plan)
+    limits = scenario.limits
+    left_s = link_delays_left_s(plan, effective_s) if scenario.control.prediction != "measured" else dict[int, float]()
     vehicles: list[VehicleCheck] = []
     for row, vehicle in enumerate(ordered):
         north_m, east_m = place[row].tolist()
@@ -173,7 +173,6 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     tolerated = plan.tolerance(assumed_s)
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
-    drawn, effective_s = drawn_delays(plan), effective_loop_delays_s(plan)
     left = {own: _headroom(plan, row, effective_s[own], delays_s[own]) for row, own in enumerate(formation.system_ids)}
     critical = min(left, key=left.__getitem__)
     nearest = nearest_planned(scenario)
@@ -182,7 +181,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         phase_s=_phase_s(scenario),
         effective_loop_delay_s=_known(effective_s[critical]),
         effective_headroom=_known(left[critical]),
-        channels_not_included=waits_for_channels(scenario),
+        channels_not_included=bool(use) and inf in effective_s.values(),
+        channel_use=use,
         outage_s=max(_outages_s(scenario), default=None),
         setpoint_gaps=setpoint_gaps(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
@@ -200,6 +200,20 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
+
+
+def _delays(plan: FlightPlan) -> tuple[dict[int, float], dict[int, float], dict[int, DrawnDelays], dict[str, float]]:
+    """The expected and the effective loop delays (s) of the vehicles, delays at random ticks, and the use of channels.
+
+    They are drawn over the links, or flown where datagrams wait for a channel. A vehicle that no command reaches in
+    such a flight has an infinite effective delay; the others are without the channel.
+    """
+    expected_s, effective_s, drawn = planned_loop_delays_s(plan), effective_loop_delays_s(plan), drawn_delays(plan)
+    if not waits_for_channels(plan.scenario):
+        return expected_s, effective_s, drawn, {}
+    flown = over_channels(plan)
+    medians_s = {own: float(np.median(each.loop_s, axis=1).mean()) for own, each in flown.drawn.items()}
+    return expected_s | medians_s, effective_s | flown.effective_s, drawn | flown.drawn, flown.use
 
 
 def _phase_s(scenario: Scenario) -> float:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gains.core.arrays import FloatArray, IntArray
+from gains.sampled.multirate import effective_delay_s
 from gcs.control.phases import Phase
 from gcs.control.tick import Event, TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
@@ -20,7 +21,7 @@ from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import why_unknown
 from gcs.runs.files import RunTail, read_ticks, write_experiment
-from gcs.runs.grade import Truth, read_truth
+from gcs.runs.grade import Truth, commands_of, commands_on_board, read_truth
 from gcs.runs.record import END, EVENTS_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
 from gcs.station.station import Station
 from scenarios.networks import networks_of
@@ -151,6 +152,23 @@ def _medians(ticks: TickArray, values: FloatArray, system_ids: tuple[int, ...]) 
         known = own[np.isfinite(own)]
         found[system_id] = float(np.median(known)) if known.size else 0.0
     return found
+
+
+def effective_delays_s(
+    plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
+) -> dict[int, float]:
+    """For each vehicle, the constant loop delay equivalent to those of its commands in these rows."""
+    truth = flight.truth
+    assert truth is not None
+    on_board, held_s = plan.scenario.control.loop == "onboard", plan.timing.held_s
+
+    def commands(system_id: int) -> IntArray:
+        if not on_board:
+            return commands_of(rows, truth, system_id)
+        whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
+        return commands_on_board(whole, truth, system_id)
+
+    return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 
 
 def first_uses(ticks: TickArray) -> TickArray:

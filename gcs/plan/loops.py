@@ -11,7 +11,7 @@ from math import inf, isnan, nan
 
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
-from gcs.plan.expected_delay import effective_loop_delays_s, planned_loop_delays_s
+from gcs.plan.expected_delay import planned_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
@@ -138,12 +138,13 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
     return len({delays_s[own] for own in block.system_ids}) > 1
 
 
-def link_delays_left_s(plan: FlightPlan) -> dict[int, float]:
+def link_delays_left_s(plan: FlightPlan, now_s: Mapping[int, float]) -> dict[int, float]:
     """How much more delay (s) each vehicle's link can take, all others as in the scenario; NaN where unknown.
 
-    It is unknown in a shared loop on board, where an up link also delays the commands of others.
+    `now_s` are the effective loop delays. It is unknown in a shared loop on board, where an up link also delays the
+    commands of others.
     """
-    now_s, windows, left_s = effective_loop_delays_s(plan), dict[Hashable, Window](), dict[int, float]()
+    windows, left_s = dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
         for system_id in block.system_ids:
             alone = len(block.system_ids) == 1

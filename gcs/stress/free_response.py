@@ -30,14 +30,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gains.core.arrays import FloatArray, IntArray
-from gains.sampled.multirate import effective_delay_s
+from gains.core.arrays import FloatArray
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray, chosen
-from gcs.drive.flown import Flight, fly_plan, median_delays_s
+from gcs.drive.flown import Flight, effective_delays_s, fly_plan, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import is_modelled
-from gcs.runs.grade import commands_of, commands_on_board
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from scenarios.keys.autopilot import Sitl
@@ -123,23 +121,6 @@ def response_paired(
         errors[name] -= calm_rows[name]
     varying = not has_constant_links(plan.scenario)
     return FreeResponse(disturbed, flight, errors, min(until_s, calm_until_s), varying, calm_until_s)
-
-
-def effective_delays_s(
-    plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
-) -> dict[int, float]:
-    """For each vehicle, the constant loop delay equivalent to those of its commands in these rows."""
-    truth = flight.truth
-    assert truth is not None
-    on_board, held_s = plan.scenario.control.loop == "onboard", plan.timing.held_s
-
-    def commands(system_id: int) -> IntArray:
-        if not on_board:
-            return commands_of(rows, truth, system_id)
-        whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
-        return commands_on_board(whole, truth, system_id)
-
-    return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 
 
 def _linear_range(plan: FlightPlan) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from gains.sampled.coupled_block import CoupledBlock, critical_block
 from gcs.control.tick import TickArray, chosen
-from gcs.drive.flown import first_uses, fly_plan, median_ages_s, median_delays_s
+from gcs.drive.flown import effective_delays_s, first_uses, fly_plan, median_ages_s, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import is_modelled, plan_loops, plan_over_links
@@ -132,7 +132,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """Probe the loop that breaks first on the scenario's own links, by the difference of two flights."""
     base = plan_of(trial)
     calm = free_response.fly_calm(base, _folder_of(folder, 0.0))
-    delays_s = free_response.effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
+    delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     probed = _loop_of(plan_loops(base), delays_s, trial.probe, _ages_s(base, calm.ticks))
     _, link_s, waiting_s = _delays_of(base, probed, delays_s, outcome)
     past = free_response.past_limits(base.scenario, chosen(calm.ticks, calm.ticks["commanded"]))

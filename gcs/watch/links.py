@@ -70,6 +70,12 @@ class LinkFigures(Published):
     telemetry_age_s: Estimate
     loop_delay_s: Estimate
     headroom: float | None
+    """1 - 99th percentile of the loop delay / margin."""
+    effective_loop_delay_s: float | None
+    """The mean loop delay, on which stability depends. Lost positions lengthen it; lost set-points, which cannot be
+    seen here, would lengthen it further."""
+    effective_headroom: float | None
+    """1 - effective loop delay / margin."""
     unjudged: bool
     """Whether there is a margin, but the loop delay was unknown or a lower bound for most of the last quarter."""
     received: int
@@ -208,7 +214,11 @@ class WatchedVehicle:
             bounds = {"status": LOWER_BOUND if self.states else "unknown"}
             age_s, loop_s = (looks.model_copy(update=bounds) for looks in (age_s, loop_s))
         span_s = (self.state_ns - self.first_state_ns) * 1e-9
-        left = None if margin_s is None or loop_s.p99 is None else headroom(loop_s.p99, margin_s)
+        effective_s = _mean_s(self.loop_delay_s[: self._judged], last)
+        left, effective_left = (
+            None if margin_s is None or late_s is None else headroom(late_s, margin_s)
+            for late_s in (loop_s.p99, effective_s)
+        )
         return LinkFigures(
             system_id=self.remote.system_id,
             status=self._status(now_ns, loop_s.p99, left),
@@ -217,6 +227,8 @@ class WatchedVehicle:
             telemetry_age_s=age_s,
             loop_delay_s=loop_s,
             headroom=left if margin_s else None,
+            effective_loop_delay_s=effective_s,
+            effective_headroom=effective_left if margin_s else None,
             unjudged=margin_s is not None and (known is None or not self._known_late(now_ns, last)),
             received=frames.received,
             lost=frames.lost,
@@ -414,3 +426,9 @@ class Requests:
 
 def _spread(values: "array[float]", last: int) -> Estimate:
     return estimate(np.array(values[-last:] if last else values, dtype=np.float64))
+
+
+def _mean_s(values: "array[float]", last: int) -> float | None:
+    known = np.array(values[-last:] if last else values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if known.size else None

@@ -16,7 +16,7 @@ NOT_ASKED = "many autopilots send none until a station asks; --request asks"
 RATES_UNKNOWN = "no scenario, so no rates: repetition of a position counts as loop delay"
 _SLOW = 0.9
 """Telemetry below this share of the scenario's rate is reported as slow."""
-_USUAL, _WIDE = 73, 140
+_USUAL, _WIDE = 79, 146
 """Terminal widths from which more columns are shown."""
 
 
@@ -71,8 +71,9 @@ def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
         ("p99\nms", 7, _USUAL, lambda v: _ms(v.rtt_s.p99)),
         ("age p50\nms", 8, _WIDE, lambda v: _ms(v.telemetry_age_s.p50, _bound(v))),
         ("p99\nms", 7, _WIDE, lambda v: _ms(v.telemetry_age_s.p99, _bound(v))),
-        ("loop p50\nms", 9, _USUAL, lambda v: _ms(v.loop_delay_s.p50, _bound(v))),
-        ("p99\nms" if width >= _USUAL else "loop p99\nms", 9, 0, lambda v: _ms(v.loop_delay_s.p99, _bound(v))),
+        ("loop p50\nms", 8, _USUAL, lambda v: _ms(v.loop_delay_s.p50, _bound(v))),
+        ("p99\nms" if width >= _USUAL else "loop p99\nms", 8, 0, lambda v: _ms(v.loop_delay_s.p99, _bound(v))),
+        ("mean\nms", 7, _USUAL, lambda v: _ms(v.effective_loop_delay_s, _bound(v))),
         ("headroom\n%", 8, 0, headroom),
         ("lost\n%", 6, _USUAL, lambda v: number_text(100 * v.lost / (v.received + v.lost or np.nan), ".1f")),
         ("late", 4, _WIDE, lambda v: str(v.late)),

@@ -169,6 +169,11 @@ class Fleet:
         ended = sum(link.entered + link.counts["duplicated"] - link.under_way for link in links)
         return sum(link.dropped for link in links) / max(ended, 1)
 
+    @property
+    def channel_needs_s(self) -> dict[str, float]:
+        """See LinkSet.channel_needs_s."""
+        return self._links.channel_needs_s()
+
     def vehicle(self, system_id: int) -> Shell[DoubleIntegrator | Copter | ExternallyFlown]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle

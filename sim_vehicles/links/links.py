@@ -50,6 +50,8 @@ class Channel:
         self._most_datagrams = channel.queue_datagrams
         self._free_ns = 0
         """When everything accepted so far has been sent."""
+        self.needed_ns = 0
+        """The time that it takes to send everything offered so far, dropped or not."""
         self._waiting: deque[tuple[int, int]] = deque()
         """(when its sending begins, bytes) of each datagram that was waiting at the last call, in order."""
         self._waiting_bytes = 0
@@ -59,7 +61,8 @@ class Channel:
 
         Calls must be in order of time.
         """
-        waiting = self._waiting
+        waiting, takes_ns = self._waiting, round(size_bytes * self._ns_per_byte)
+        self.needed_ns += takes_ns
         while waiting and waiting[0][0] <= time_ns:
             self._waiting_bytes -= waiting.popleft()[1]
         begin_ns = max(time_ns, self._free_ns)
@@ -70,7 +73,7 @@ class Channel:
                 return None
             waiting.append((begin_ns, size_bytes))
             self._waiting_bytes += size_bytes
-        self._free_ns = begin_ns + round(size_bytes * self._ns_per_byte)
+        self._free_ns = begin_ns + takes_ns
         return begin_ns, self._free_ns
 
 
@@ -245,6 +248,13 @@ class LinkSet:
     def have_channels(self) -> bool:
         """Whether links use channels, so that datagrams must enter in order of time."""
         return bool(self._channels)
+
+    def channel_needs_s(self) -> dict[str, float]:
+        """The time (s) that the channel of each name needs for everything offered; the longest of several."""
+        needs_s = dict[str, float]()
+        for (name, _, _), channel in self._channels.items():
+            needs_s[name] = max(needs_s.get(name, 0.0), channel.needed_ns / NS_PER_S)
+        return needs_s
 
     def of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of a vehicle, the same at every call."""

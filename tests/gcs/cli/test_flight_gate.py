@@ -98,7 +98,7 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
 
     assert [checked("0.8"), checked("0.82"), checked("2")] == [0, 1, 2]
     failed, refused = capfd.readouterr().err.splitlines()
-    assert failed == "failed: --assert-headroom: read 80.0%, wanted at least 82%"
+    assert failed == "failed: --assert-headroom: read 80.0% for 99 % of the set-points, wanted at least 82%"
     assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"
 
 

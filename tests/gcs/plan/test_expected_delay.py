@@ -148,8 +148,8 @@ def losing(down: Link, **control: object) -> Scenario:
 def test_a_gate_fails_where_lost_set_points_break_the_flight(prediction: Prediction) -> None:
     scenario = losing(Link(delay_s=0.02, loss_probability=0.75), prediction=prediction)
     found = check(flight_plan(scenario)[1])
-    assert found.least_headroom is not None
-    assert found.least_headroom < 0.0 < (found.headroom_p99 or 0.0)
+    assert found.effective_headroom is not None
+    assert found.effective_headroom < 0.0 < (found.headroom_p99 or 0.0)
     assert fly_virtual(scenario).summary.verdict != "stable"
 
 

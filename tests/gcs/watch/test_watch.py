@@ -12,7 +12,10 @@ from rich.console import Console
 
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
+from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.plan.design import Design, OwnMargins
+from gcs.plan.expected_delay import effective_loop_delays_s
+from gcs.plan.planner import flight_plan
 from gcs.watch.links import SYSTEM_ID, LinkFigures, Requests, Watch, WatchReport
 from gcs.watch.table import NOT_ASKED, RATES_UNKNOWN, links_table, render
 from scenarios.files import load
@@ -23,7 +26,7 @@ from sim_vehicles.links.truth import SAMPLED, MemoryRecorder
 from tests.support.fleets.flown_copters import three
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
-from tests.support.sim_client import arm, guided, heartbeat, setpoint
+from tests.support.sim_client import arm, command, guided, heartbeat, setpoint
 
 START_NS = 1_000_000_000
 MS = 1_000_000
@@ -265,7 +268,7 @@ def test_any_stream_is_taken_and_figures_are_plain_numbers(
     figures.to_json()  # which has no infinity
 
 
-@pytest.mark.parametrize("width", [50, 73, 80, 139, 140, 200])
+@pytest.mark.parametrize("width", [50, 78, 79, 80, 145, 146, 200])
 def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
     watched.run(1.5)
@@ -278,6 +281,21 @@ def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) 
     assert sum(line.endswith(" measured") for line in lines) == 3
     for line, vehicle in zip(lines[-3:], figures, strict=True):
         assert f"{100 * known(vehicle.headroom):.0f}" in line.split()
+
+
+def test_lost_positions_lengthen_the_effective_loop_delay() -> None:
+    """Against the model of a whole flight over the same links, which lose no set-point."""
+    rates = Rates(control_hz=20.0, telemetry_hz=20.0)
+    lossy = linked(Link(delay_s=0.03, loss_probability=0.3), Link(delay_s=0.02)).model_copy(update={"rates": rates})
+    watched = Watched(lossy, timesync_hz=10.0, rates=rates)
+    interval = command(SET_MESSAGE_INTERVAL, float(mavlink.LOCAL_POSITION_NED), 50_000.0)
+    watched.run(60.0, [(1, heartbeat(), START_NS), (1, interval, START_NS + 100 * MS)])
+    [expected_s] = set(effective_loop_delays_s(flight_plan(lossy)[1]).values())
+    figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3))[0]
+    effective_s = known(figures.effective_loop_delay_s)
+    assert effective_s == pytest.approx(expected_s, rel=0.05)  # 1,200 positions, of which 300 to 400 are lost
+    assert figures.effective_headroom == pytest.approx(1.0 - effective_s / 0.3)
+    assert known(figures.loop_delay_s.p50) < 0.93 * effective_s < 0.7 * known(figures.loop_delay_s.p99)
 
 
 @pytest.mark.parametrize("asked", [False, True])
