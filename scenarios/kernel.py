@@ -62,6 +62,15 @@ def _at_row(records: Records, row: int, *rest: Any) -> Any:
     return _run(records[row], *rest)
 
 
+before_compiling: list[Callable[[], None]] = []
+"""Called and removed as soon as a kernel has to be compiled because it is in no cache."""
+
+
+def _announce() -> None:
+    while before_compiling:
+        before_compiling.pop()()
+
+
 class _Kernel:
     def __init__(self, function: Callable[..., Any], *, makes_arrays: bool) -> None:
         self._function = function
@@ -108,8 +117,10 @@ class _Kernel:
             compiled = compiler.njit(_nrt=self._makes_arrays, no_cfunc_wrapper=True, no_cpython_wrapper=not for_python)(
                 self._function
             )
-            if folder is not None:
-                compiled._cache = kernel_cache.KernelCache(self._function)
+            if folder is None:
+                _announce()
+            else:
+                compiled._cache = kernel_cache.KernelCache(self._function, _announce)
             return compiled
         finally:
             settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
@@ -134,12 +145,6 @@ class _Kernel:
                     reached[f"{function.__module__}.{name}"] = repr(value).encode()
         parts = [self._name.encode(), *(name.encode() + reached[name] for name in sorted(reached))]
         return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
-
-
-def any_kept() -> bool:
-    """Whether a flight on this machine has compiled kernels before."""
-    folder = _cache("")
-    return folder is not None and any(folder.iterdir())
 
 
 def _cache(wanted: str) -> Path | None:

@@ -1,6 +1,7 @@
 """The first call of a kernel, for `scenarios/kernel.py`: how Numba caches it, and that no signal breaks into it."""
 
 import signal
+from collections.abc import Callable
 from typing import Any
 
 from numba.core import event, types
@@ -19,7 +20,17 @@ class KernelCache(FunctionCache):
     """Numba's cache for a function, with an index that names the fields of tuples.
 
     Compiled code knows them by their order, which may have changed since. And no class is looked up that has gone.
+    `before_compiling` is called where the cache has nothing.
     """
+
+    def __init__(self, function: Callable[..., Any], before_compiling: Callable[[], None]) -> None:
+        super().__init__(function)
+        self._before_compiling = before_compiling
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        if (found := super().load_overload(sig, target_context)) is None:
+            self._before_compiling()
+        return found
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*map(_described, sig), *super()._index_key(sig, codegen)[1:])

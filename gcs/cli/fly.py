@@ -123,7 +123,6 @@ def fly(
             print_design(design)
         viewer = new_viewer() if live == "new" else live and viewer_url(*options.address("--live", live))
         folder = options.run_folder(out, scenario.name)
-        options.say_if_first_flight()
         if link is None:
             summary = flying.fly_in_virtual_time(
                 plan, design, folder, show_table=not as_json, speed=speed, viewer=viewer

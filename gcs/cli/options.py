@@ -118,6 +118,7 @@ def load_scenario(
     from scenarios.shipped import located
 
     scenario = load(located(str(file)))
+    explain_compiling()
     if allow_code is not True and (refused := refusal(scenario, file, allow_code or "")):
         raise InputError(refused)
     if links is not None:
@@ -128,12 +129,13 @@ def load_scenario(
     return without(scenario, left_out, file) if left_out else scenario
 
 
-def say_if_first_flight() -> None:
-    """Explain on a terminal why the first flight on a machine starts late."""
-    from scenarios.kernel import any_kept
+def explain_compiling() -> None:
+    """Explain on a terminal why the first flight on a machine, or after an update, starts late."""
+    from scenarios.kernel import before_compiling
 
-    if sys.stderr.isatty() and not any_kept():
-        print("first flight on this machine: compiling what runs for every frame, half a minute", file=sys.stderr)
+    text = "compiling what runs for every frame, about a minute: it is kept for the next flights"
+    if sys.stderr.isatty() and not before_compiling:
+        before_compiling.append(lambda: print(text, file=sys.stderr))
 
 
 def refuse(file: Path, *findings: str | None, in_file: bool = True) -> None:

@@ -225,7 +225,6 @@ def _study(
     from gcs.stress.study import Study
 
     scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)
-    options.say_if_first_flight()
     if (disturbance and scenario.dynamics != "double_integrator") or (real_time and scenario.dynamics == "autopilot"):
         option = "--disturbance" if disturbance else "--real-time"
         options.refuse(file, f"dynamics: read {scenario.dynamics!r}, wanted double_integrator with {option}")

@@ -179,7 +179,6 @@ def capacity(
         if out is not None:
             folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
             store = stack.enter_context(contextlib.closing(loads_of(folder, scenario, resume=resume)))
-        options.say_if_first_flight()
         if not as_json:
             each = f"up to {seeds} flights of {SECONDS:g} s" if seeds > 1 else f"one flight of {SECONDS:g} s"
             count = formations_at_most(len(rates_hz), most)

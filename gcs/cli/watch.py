@@ -88,6 +88,7 @@ def monitor(
         from gcs.watch.live import watch_links
         from gcs.watch.saved_links import LinkRecorder
 
+        options.explain_compiling()
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
         position_hz = scenario.rates.telemetry_hz if scenario else _POSITION_HZ
         watch = Watch((vehicle.system_id for vehicle in scenario.vehicles), scenario.rates) if scenario else Watch()

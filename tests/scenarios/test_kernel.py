@@ -6,6 +6,7 @@ import pkgutil
 import signal
 import sys
 from collections.abc import Iterator
+from functools import partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from gains.core.arrays import FloatArray
+from scenarios import kernel as kernel_module
 from scenarios.kernel import array_kernel, kernel
 
 NUMBERS = {type(None), bool, int, float}
@@ -83,14 +85,17 @@ def test_what_one_copy_of_the_source_compiled_no_other_compiles(
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     text = "from scenarios.kernel import kernel\n\n\n@kernel\ndef square(n: int) -> int:\n    return n * n\n"
     known: list[int] = []
+    announced: list[str] = []
     for name, source in (("first", text), ("second", text), ("changed", text.replace("n * n", "n * n + 1"))):
         (tmp_path / name).mkdir()
         file = tmp_path / name / "square.py"
         file.write_text(source, encoding="utf-8")
         square = loaded(file).square
+        monkeypatch.setattr(kernel_module, "before_compiling", [partial(announced.append, name)])
         assert square(3) == 9 + (name == "changed")
         known.append(sum(square._compiled.stats.cache_hits.values()))
     assert known == [0, 1, 0]
+    assert announced == ["first", "changed"]
 
 
 @pytest.mark.parametrize(
