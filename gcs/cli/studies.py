@@ -155,6 +155,7 @@ def capacity(
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=MOST_VEHICLES, help="largest formation tried")] = 100,
     seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; all must succeed")] = 3,
+    links: options.LinksOption = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="store flights in this new or empty folder")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="resume the study in --out")] = False,
     as_json: options.AsJson = False,
@@ -172,7 +173,7 @@ def capacity(
         out = options.campaign_folder(out, "--resume", "study")
     rates_hz = _rates(rates)
     wanted = "a scenario without code: gcs capacity changes its formation"
-    scenario = options.load_scenario(scenario_file, allow_code=wanted)
+    scenario = options.load_scenario(scenario_file, links=links, allow_code=wanted)
     options.refuse(scenario_file, unflyable(scenario, most))
     with contextlib.ExitStack() as stack:
         store = None
