@@ -72,12 +72,12 @@ class HeldPlant(ByContent):
     period_s: float
     measured: BoolArray | None = None
 
-    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """e^{A t} (k, n, n) and int_0^t e^{A s} ds B (k, n, r) for k durations t."""
+    def transition(self, duration_s: FloatArray, *, less_one: bool = False) -> tuple[FloatArray, FloatArray]:
+        """e^{A t} (k, n, n) and int_0^t e^{A s} ds B (k, n, r) for k durations t; `less_one`: e^{A t} - I."""
         n, inputs = self.B.shape
         generator = np.zeros((n + inputs, n + inputs))
         generator[:n, :n], generator[:n, n:] = self.A, self.B
-        exponentials = matrix_exponentials(generator, duration_s)
+        exponentials = matrix_exponentials(generator, duration_s, less_one=less_one)
         return exponentials[:, :n, :n], exponentials[:, :n, n:]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
@@ -94,10 +94,11 @@ class HeldPlant(ByContent):
         return maps
 
 
-def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatArray:
+def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_one: bool = False) -> FloatArray:
     """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
 
-    All durations share the powers of X: SciPy's `expm` takes 60 us for each matrix of a stack.
+    `less_one` gives e^{X t} - I, with all its digits however short t is. All durations share the powers of X: SciPy's
+    `expm` takes 60 us for each matrix of a stack.
     """
     longest = float(durations.max(initial=0.0))
     norm = float(np.abs(generator).sum(axis=-1).max(initial=0.0)) * longest
@@ -107,9 +108,10 @@ def matrix_exponentials(generator: FloatArray, durations: FloatArray) -> FloatAr
     for degree in range(1, 15):
         terms.append(scaled @ terms[-1] / degree)
     shares = durations / longest if longest > 0.0 else durations
-    result = np.tensordot(np.vander(shares, 15, increasing=True), np.array(terms), 1)
+    first = 1 if less_one else 0
+    result = np.tensordot(np.vander(shares, 15, increasing=True)[:, first:], np.array(terms[first:]), 1)
     for _ in range(squarings):
-        result = result @ result
+        result = result @ result + 2.0 * result if less_one else result @ result
     return result
 
 

@@ -6,6 +6,7 @@ pushed at the right instants), so the march through the periods continues past t
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import inf
 
@@ -30,6 +31,8 @@ _DECAYED, _GROWN = 40.0, 30.0
 _STILL = 1e-12
 # a double eigenvalue of the map, as of an undamped plant sampled once a turn, is known to sqrt(eps)
 _TOUCH = 1e-7
+# squared radii below this are rounding
+_LEAST = 1e-15
 
 
 @dataclass(frozen=True)
@@ -116,23 +119,28 @@ def _last_period(A: FloatArray) -> tuple[float, bool]:
 def _is_stable(blocks: list[HeldPlant], window: tuple[float, float], last_s: float) -> bool:
     start_s, end_s = window[0], min(window[1], last_s)
     middle = np.array([(start_s + end_s) / 2.0])
-    return end_s > start_s * (1.0 + 1e-12) and all(np.abs(_eigenvalues(block, middle)).max() < 1.0 for block in blocks)
+    return end_s > start_s * (1.0 + 1e-12) and all(_log_radius(block, middle)[0] < 0.0 for block in blocks)
 
 
-def _eigenvalues(block: HeldPlant, periods_s: FloatArray) -> ComplexArray:
-    """Eigenvalues of the one-period map at each period (k,), shape (k, n)."""
-    states, hold = block.transition(periods_s)
+def _changes(block: HeldPlant, periods_s: FloatArray) -> ComplexArray:
+    """Eigenvalues of the one-period map less one at each period (k,), shape (k, n)."""
+    states, hold = block.transition(periods_s, less_one=True)
     return np.linalg.eigvals(states + hold @ block.K).astype(np.complex128)
+
+
+def _log_radius(block: HeldPlant, periods_s: FloatArray) -> FloatArray:
+    """Logarithm of the spectral radius of the one-period map at each period (k,): half that of |1 + z|^2."""
+    z = _changes(block, periods_s)
+    return 0.5 * np.log1p(np.maximum((2.0 * z.real + np.abs(z) ** 2).max(axis=1), _LEAST - 1.0))
 
 
 def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCrossing], float]]:
     """For each step of the march: crossings of one block's spectral radius through one, and the period (s) reached."""
 
-    def log_radius(periods_s: FloatArray) -> FloatArray:
-        return np.log(np.maximum(np.abs(_eigenvalues(block, periods_s)).max(axis=1), 1e-300))
+    log_radius = partial(_log_radius, block)
 
     def crossing(period_s: float, direction: int) -> PeriodCrossing:
-        [eigenvalues] = _eigenvalues(block, np.array([period_s]))
+        eigenvalues = 1.0 + _changes(block, np.array([period_s]))[0]
         angle = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))])))
         return PeriodCrossing(angle / period_s, period_s, direction)
 

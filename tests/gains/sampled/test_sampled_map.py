@@ -95,6 +95,12 @@ def test_exponentials_are_those_of_scipy(size: float) -> None:
         assert np.abs(ours - theirs).max() <= 1e-11 * np.abs(theirs).max()
 
 
+def test_what_an_exponential_adds_to_one_keeps_its_digits() -> None:
+    times = np.array([1e-14, 1e-6, 0.3, 40.0])
+    [[ours]] = matrix_exponentials(np.array([[-0.7]]), times, less_one=True).T
+    assert ours == pytest.approx(np.expm1(-0.7 * times), rel=1e-13)
+
+
 @pytest.mark.parametrize(
     ("A", "B", "K", "message"),
     [

@@ -200,6 +200,16 @@ def test_period_limit_of_a_follower_is_the_same_in_turned_coordinates(angle: flo
     assert analyse_period(turn @ A @ turn.T, turn @ B, K @ turn.T).limit_s == pytest.approx(2.0, rel=1e-10)
 
 
+@pytest.mark.parametrize(("a", "b", "error"), [(3.0, 100.0, 1e-3), (20.0, 100.0, 0.1)])
+def test_period_limit_of_mixed_states_is_as_right_as_their_numbers(a: float, b: float, error: float) -> None:
+    """All entries are exact, up to 4e6: the limit is 2 s over the gain. Periods of 1e-11 s were taken as unstable."""
+    mix, back = np.array([[1.0, a], [b, 1.0 + a * b]]), np.array([[1.0 + a * b, -a], [-b, 1.0]])
+    gain = 1.0 + 2.0**-10
+    A, B = back @ np.array([[0.0, 1.0], [0.0, 0.0]]) @ mix, back @ np.array([[0.0], [1.0]])
+    K = np.array([[-gain, -1.0]]) @ mix
+    assert analyse_period(A, B, K).limit_s == pytest.approx(2.0 / gain, rel=error)
+
+
 def test_a_stable_plant_with_small_gain_has_no_period_limit() -> None:
     assert analyse_period([[-1.0]], [[1.0]], [[-0.5]]).limit_s == inf
 
