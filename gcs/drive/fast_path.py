@@ -11,7 +11,7 @@ import numpy as np
 
 from gcs.control.tick import TICK, TickArray
 from gcs.link.datagram import Address, Arrivals
-from gcs.station.fast_path import DONE, DUE, NOT_JUDGED, WITH_TICK, FastPathData, Sending, fast_step
+from gcs.station.fast_path import DONE, NOT_JUDGED, WITH_TICK, FastPathData, Sending, fast_step
 from gcs.station.station import Station
 from scenarios.kernel import Columns, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
@@ -31,9 +31,8 @@ NOT_LEFT, PAUSED = -1, -2
 step. PAUSED: the steps are complete, but Python must take the rows and datagrams."""
 _STEPS = 4
 """Number of steps whose datagrams the buffers hold."""
-_FIRST_TICKS, _MOST_TICKS, _MOST_ROWS = 4, 128, 1024
-"""Ticks flown in one call when nothing needs them one at a time: initially few, because Python is soon needed again,
-doubling up to the maximum; and the maximum number of rows."""
+_MOST_TICKS, _MOST_ROWS = 128, 1024
+"""Maximum number of ticks, and of their rows, flown in one call when nothing needs them one at a time."""
 _WIRE = np.dtype(
     [
         ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams not yet passed on to Python
@@ -59,8 +58,6 @@ class LinkBuffers(NamedTuple):
     """The table of the sent datagrams."""
     none_queued: Ints
     """Zeros: no datagram has waited in a socket buffer."""
-    due: Records
-    """Records of DUE for the next ticks."""
     rows: Records
     """The rows of the ticks done in this call, in order."""
 
@@ -101,10 +98,9 @@ class FastPath:
         arrivals, to = np.zeros((2, 4, most), np.int64)
         ticks = max(1, min(_MOST_TICKS, _MOST_ROWS // n)) if ahead else 1
         self._wire = LinkBuffers(
-            np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(most, np.int64), np.zeros(ticks, DUE),
-            np.empty(ticks * n, TICK),
-        )  # fmt: skip
-        self._state, self._most_ticks = Columns(self._wire.state), ticks
+            np.zeros(1, _WIRE), arrived, arrivals, sent, to, np.zeros(most, np.int64), np.empty(ticks * n, TICK)
+        )
+        self._state = Columns(self._wire.state)
         self._row_bytes = self._wire.rows.view(np.uint8)  # numpy copies bytes ten times faster than records
         self._tick_bytes = n * TICK.itemsize
         self._handle: Handle | None = None
@@ -123,28 +119,31 @@ class FastPath:
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
         data, senders = station.fast_path_data, station.senders(self._addresses)
-        arrived, ticks, most, left = state["arrived"], state["ticks"], min(_FIRST_TICKS, self._most_ticks), _NOT_YET
-        while True:
-            self._fleet.make_ready()
+        arrived, ticks, left = state["arrived"], state["ticks"], _NOT_YET
+
+        def run(left: int) -> int:
             ends = Ends(self._fleet.arrays, data, self._places, senders, wire)
             if self._handle is None or not _same(ends, self._handle.kept):
-                self._handle = handle(ends)
-            how_far = _fly(self._handle, station.look_ahead(wire.due, most), self._room, self._ahead, left)
-            most, left = min(2 * most, self._most_ticks), _NOT_YET
-            if how_far in (PAUSED, NOT_JUDGED):
+                self._handle = handle(ends)  # the vehicles' part in Python may have replaced arrays
+            return _fly(self._handle, self._room, self._ahead, left)
+
+        while True:
+            station.look_ahead()
+            self._fleet.make_ready()
+            ticks[0] = 0
+            how_far = run(_NOT_YET)
+            while how_far == NOT_LEFT and self._fleet.all_left(left := self._leave()):
+                how_far = run(left)
+            if how_far in (NOT_LEFT, PAUSED, NOT_JUDGED):
                 self._pass_on(arrived[0])
             if ticks[0]:
                 yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
             if how_far == NOT_JUDGED:
-                nobody = np.zeros(len(self._places), np.int64)
-                tick = station.unjudged(wire.due["time_s"].item(ticks[0]), state["now_ns"][0], nobody)
+                tick = station.unjudged(state["now_ns"][0], np.zeros(len(self._places), np.int64))
                 yield station.complete(tick, [tick.due_ns])
             if how_far == NOT_LEFT:
-                left = self._leave()
-                if not self._fleet.all_left(left):
-                    self._pass_on(arrived[0])
-                    return Stopped(state["now_ns"][0], self._fleet.left(left, state["now_ns"][0]), 0)
-            elif how_far not in (PAUSED, NOT_JUDGED):
+                return Stopped(state["now_ns"][0], self._fleet.left(left, state["now_ns"][0]), 0)
+            if how_far not in (PAUSED, NOT_JUDGED):
                 return self._not_taken(state["now_ns"][0])
             if ticks[0] or how_far == NOT_JUDGED:
                 station.frames.clear()
@@ -180,8 +179,8 @@ def _same(one: Any, other: Any) -> bool:
 
 
 @array_kernel
-def _fly(ends: Any, known: int, room: int, ahead: bool, left: int) -> int:
-    """Do steps while they need no Python, up to the last of the `known` ticks; returns the code of the progress made.
+def _fly(ends: Any, room: int, ahead: bool, left: int) -> int:
+    """Do steps while they need no Python and there is room for rows; returns the code of the progress made.
 
     `ends` is a handle on `Ends`. While at most `room` datagrams have arrived, those of one more step fit into the
     buffer; with `ahead`, those of earlier steps are discarded. The vehicles' part of the first step is done if `left`,
@@ -189,24 +188,23 @@ def _fly(ends: Any, known: int, room: int, ahead: bool, left: int) -> int:
     """
     wire = ends.arrays[-1]
     state = wire.state[0]
-    state.ticks = 0
     while True:
         if left == _NOT_YET and state.arrived > room:
             if not ahead:
                 return PAUSED
             state.arrived = state.arrived_bytes = 0
         state.now_ns = state.next_ns
-        how_far, left = _step(ends, known, left), _NOT_YET
+        how_far, left = _step(ends, left), _NOT_YET
         if how_far == WITH_TICK:
             state.ticks += 1
-            if state.ticks == known:
+            if state.ticks * len(ends.arrays[2]) == len(wire.rows):
                 return PAUSED
         elif how_far != DONE:
             return how_far
 
 
 @array_kernel
-def _step(ends: Any, known: int, leaving: int) -> int:
+def _step(ends: Any, leaving: int) -> int:
     """Do one step as far as it needs no Python; returns its progress as a code. For `leaving` see `left` of `_fly`."""
     fleet, data, places, senders, wire = ends.arrays
     state, n = wire.state[0], len(places)
@@ -222,9 +220,8 @@ def _step(ends: Any, known: int, leaving: int) -> int:
             return NOT_LEFT
     data.schedule[0].now_ns = now_ns
     table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
-    due = wire.due[min(ticks, len(wire.due) - 1)]
     how_far, state.taken, first, second, third = fast_step(
-        data, wire.arrived, table, wire.none_queued[:leaving], senders, due, ticks < known,
+        data, wire.arrived, table, wire.none_queued[:leaving], senders,
         wire.rows[ticks * n : (ticks + 1) * n],
     )  # fmt: skip
     state.sent = state.sent_bytes = 0

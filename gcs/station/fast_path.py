@@ -107,6 +107,8 @@ class FastPathData(NamedTuple):
 
     schedule: Records
     """Of SCHEDULE, (1,)."""
+    coming: Records
+    """Of COMING, (1,)."""
     limits: TickLimits
     tables: Tables
     row_of: Ints
@@ -125,9 +127,19 @@ class FastPathData(NamedTuple):
     scratch: Scratch
 
 
-DUE = np.dtype([("flying", "?"), ("clock_row", "i8"), ("time_s", "f8"), ("velocity_ne_m_s", "f8", (2,))], align=True)
-"""Data of a future tick from Python: whether the formation is flown, its scenario time, its nominal velocity. Python
-does the tick if the clock of the vehicle in `clock_row` has become known; -1 for none."""
+COMING = np.dtype(
+    [
+        ("flying", "?"),
+        ("velocity_ne_m_s", "f8", (2,)),  # nominal
+        ("zero_ns", "i8"), ("before_s", "f8"),  # `Journal.zero`
+        ("since_ns", "i8"),  # when the phase began
+        # Python does the ticks from these times on, in ns, s of the phase and scenario time
+        ("quiet_until_ns", "f8"), ("longest_s", "f8"), ("steady_until_s", "f8"),
+        ("clock_row", "i8"),  # and those after the clock of this vehicle has become known; -1 for none
+    ],
+    align=True,
+)  # fmt: skip
+"""What Python says of the coming ticks."""
 
 
 @array_kernel
@@ -137,15 +149,12 @@ def fast_step(
     table: Ints,
     queued_ns: Ints,
     senders: Ints,
-    due: Record,
-    known: bool,
     rows: Records,
 ) -> tuple[int, int, Sending, Sending, Sending]:
     """Do a step, or as much of it as needs no Python, at the schedule's `now_ns`.
 
     Stream, table and `queued_ns` are those of `Arrivals`. Returns the outcome, how many datagrams were processed, and
-    the frames to send, in order. `due`, of DUE, is the next tick. `known`: Python has filled it in and allows a kernel
-    to do that tick. `rows` receives the rows of the tick.
+    the frames to send, in order. `rows` receives the rows of the tick.
     """
     schedule, tables = data.schedule[0], data.tables
     nothing, taken = data.scratch.nothing, 0
@@ -159,10 +168,10 @@ def fast_step(
         if tables.news[place].kind != ANSWER:
             return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
-        if not known or schedule.now_ns > schedule.next_tick_ns or not _is_calm(data, due):
+        if schedule.now_ns > schedule.next_tick_ns or not _is_calm(data):
             return NOT_DONE, taken, nothing, nothing, nothing
         answers = _answered(tables, nothing)
-        set_points, judged = _tick(data, due, rows)
+        set_points, judged = _tick(data, rows)
         return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
     answers = _answered(tables, nothing)
     heartbeats = requests = nothing
@@ -211,14 +220,25 @@ def requested(schedules: Records, known: Records, clocks: Records, pending_ns: A
 
 
 @kernel
-def _is_calm(data: FastPathData, due: Record) -> bool:
-    """Whether the monitor only has to record delays and times; if so, it records them."""
-    limits, silent, judged = data.limits, data.scratch.silent, data.watched.judged[0]
-    if due.clock_row >= 0 and data.tables.clocks[due.clock_row].samples >= LEAST_SAMPLES:
+def _time_s(data: FastPathData) -> float:
+    """The scenario time of the next tick, as `Journal.scenario_time_s`."""
+    return (data.schedule[0].next_tick_ns - data.coming[0].zero_ns) / NS_PER_S - data.coming[0].before_s
+
+
+@kernel
+def _is_calm(data: FastPathData) -> bool:
+    """Whether no Python is due, and the monitor only has to record delays and times; if so, it records them."""
+    limits, silent, judged, coming = data.limits, data.scratch.silent, data.watched.judged[0], data.coming[0]
+    due_ns, time_s = data.schedule[0].next_tick_ns, _time_s(data)
+    if due_ns >= coming.quiet_until_ns or time_s >= coming.steady_until_s:
+        return False
+    if (due_ns - coming.since_ns) / NS_PER_S >= coming.longest_s:
+        return False
+    if coming.clock_row >= 0 and data.tables.clocks[coming.clock_row].samples >= LEAST_SAMPLES:
         return False
     for row in range(len(silent)):
         silent[row] = data.schedule[0].now_ns - data.tables.telemetry_ns[row] > limits.silence_ns
-    seen = Seen(due.time_s, due.flying, silent, data.guided, data.critical, data.used_s)
+    seen = Seen(time_s, coming.flying, silent, data.guided, data.critical, data.used_s)
     if judge(data.watched, seen, data.policy, limits.separable) > 0:
         data.watched.judged[0] = judged
         return False
@@ -227,16 +247,16 @@ def _is_calm(data: FastPathData, due: Record) -> bool:
 
 
 @array_kernel
-def fast_set_points(data: FastPathData, due: Records) -> tuple[bool, Sending]:
-    """Make the set-points of the tick due now, DUE (1,). If it needs Python, nothing is done and False is returned."""
-    if not _is_calm(data, due[0]):
+def fast_set_points(data: FastPathData) -> tuple[bool, Sending]:
+    """Make the set-points of the tick due now. If it needs Python, nothing is done and False is returned."""
+    if not _is_calm(data):
         return False, data.scratch.nothing
-    set_points, _ = _command(data, due[0])
+    set_points, _ = _command(data)
     return True, set_points
 
 
 @array_kernel
-def _command(data: FastPathData, due: Record) -> tuple[Sending, NDArray[np.bool_]]:
+def _command(data: FastPathData) -> tuple[Sending, NDArray[np.bool_]]:
     """The set-points of the tick due now, and which vehicles follow the control law."""
     schedule, limits, tables, law = data.schedule[0], data.limits, data.tables, data.law
     controls, points, due_ns = data.scratch.controls, data.scratch.points, schedule.next_tick_ns
@@ -245,10 +265,10 @@ def _command(data: FastPathData, due: Record) -> tuple[Sending, NDArray[np.bool_
     schedule.tick_count += ticks
     times_ns, states = every_newest(tables.reports, tables.report_counts)
     seen = every_at(tables.reports, tables.report_counts, law.source, times_ns[law.to])
-    north_m_s, east_m_s = due.velocity_ne_m_s
+    north_m_s, east_m_s = data.coming[0].velocity_ne_m_s
     control_all(controls, law, times_ns, states, seen, data.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
-    followed = commanded(controls, data.watched.states.released, due.flying)
+    followed = commanded(controls, data.watched.states.released, data.coming[0].flying)
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
@@ -266,11 +286,11 @@ def _key_ms(schedule: Record, due_ns: int) -> int:
 
 
 @array_kernel
-def _tick(data: FastPathData, due: Record, rows: Records) -> tuple[Sending, bool]:
+def _tick(data: FastPathData, rows: Records) -> tuple[Sending, bool]:
     """Do the tick due now. Returns its set-points, and False if `rows` are not filled: the formation may be broken."""
     schedule, limits, tables, controls = data.schedule[0], data.limits, data.tables, data.scratch.controls
-    due_ns, number = schedule.next_tick_ns, schedule.tick_count
-    set_points, followed = _command(data, due)
+    due_ns, number, time_s = schedule.next_tick_ns, schedule.tick_count, _time_s(data)
+    set_points, followed = _command(data)
     repeated = repeated_s(data.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
     down_m = np.empty(len(controls) if limits.has_slots else 0)
     for row in range(len(down_m)):
@@ -279,7 +299,9 @@ def _tick(data: FastPathData, due: Record, rows: Records) -> tuple[Sending, bool
     closest_m = inf
     for row in range(len(near_m)):
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
-    if due.flying and (closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)):
+    if data.coming[0].flying and (
+        closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)
+    ):
         return set_points, False
     states = data.watched.states
     judged = Judged(
@@ -289,7 +311,7 @@ def _tick(data: FastPathData, due: Record, rows: Records) -> tuple[Sending, bool
     sent_ns = np.full(len(controls), due_ns)
     fill(
         rows, data.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
-        number, due.time_s, due_ns, _key_ms(schedule, due_ns),
+        number, time_s, due_ns, _key_ms(schedule, due_ns),
     )  # fmt: skip
     return set_points, True
 

@@ -1,7 +1,5 @@
 """The journal of a flight: its events, and the reason why it is to end. All parts of a station write to it."""
 
-from typing import Any
-
 from gcs.control.tick import Event
 from scenarios.schema import NS_PER_S
 
@@ -22,11 +20,15 @@ class Journal:
         """When the formation flight began."""
         self._start_ns, self._patience_s = start_ns, patience_s
 
-    def scenario_time_s(self, now_ns: Any) -> Any:
-        """Time since the flight began; before that, time since the start minus the patience: negative. Takes arrays."""
-        if self.flight_start_ns is None:
-            return (now_ns - self._start_ns) / NS_PER_S - self._patience_s
-        return (now_ns - self.flight_start_ns) / NS_PER_S
+    @property
+    def zero(self) -> tuple[int, float]:
+        """The instant from which `scenario_time_s` counts, and the time that it subtracts."""
+        return (self._start_ns, self._patience_s) if self.flight_start_ns is None else (self.flight_start_ns, 0.0)
+
+    def scenario_time_s(self, now_ns: int) -> float:
+        """Time since the flight began; before that, time since the start minus the patience: negative."""
+        zero_ns, before_s = self.zero
+        return (now_ns - zero_ns) / NS_PER_S - before_s
 
     def request_stop(self, reason: str) -> None:
         """End the flight at the next tick; an empty reason is ignored."""

@@ -6,6 +6,7 @@ virtual time, with the same bytes.
 
 from collections.abc import Callable, Iterable, Sequence
 from math import hypot, inf, nan
+from operator import is_
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import GROUNDED, LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fast_path import (
-    DUE,
+    COMING,
     HEARTBEAT_NS,
     SCHEDULE,
     FastPathData,
@@ -115,7 +116,9 @@ class Station:
         }.items():  # fmt: skip
             self._schedule[name] = value
         self._used_s, self._repeated_ns = np.full(n, nan), np.zeros((2, n), np.int64)
-        self._scratch, self._due = new_scratch(n), np.zeros(1, DUE)
+        self._scratch, self._coming = new_scratch(n), np.zeros(1, COMING)
+        self._data: FastPathData | None = None
+        """The last `fast_path_data`."""
         self._system_ids = np.array([vehicle.system_id for vehicle in self.vehicles])
         self._targets = np.array([vehicle.wire_id for vehicle in self.vehicles])
         measured = scenario.control.prediction == "measured"
@@ -171,48 +174,45 @@ class Station:
     @property
     def fast_path_data(self) -> FastPathData:
         """The data of fast steps; valid until the next step in Python, which may replace parts of them."""
-        monitor, tolerated = self._monitor, self._tolerated
+        monitor, tolerated, data = self._monitor, self._tolerated, self._data
         assert tolerated is not None
-        return FastPathData(
-            self._schedule, self._limits, self._reception.tables, self._reception.row_of, self._law,
-            monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
-            self._critical, tolerated[0], self._used_s, self._repeated_ns, self._system_ids, self._targets,
-            HEARTBEAT, self._scratch,
-        )  # fmt: skip
+        replaced = self._reception.tables, self._law, monitor.newest_blends, tolerated[0]
+        if data is None or not all(map(is_, replaced, (data.tables, data.law, data.blends, data.shorter_s))):
+            data = self._data = FastPathData(
+                self._schedule, self._coming, self._limits, self._reception.tables, self._reception.row_of, self._law,
+                monitor.newest_blends, monitor.watched._replace(margins_s=tolerated[1]), monitor.policy, self._guided,
+                self._critical, tolerated[0], self._used_s, self._repeated_ns, self._system_ids, self._targets,
+                HEARTBEAT, self._scratch,
+            )  # fmt: skip
+        return data
 
     @property
     def has_fast_path(self) -> bool:
         """Whether steps may take the fast path of `gcs.station.fast_path`."""
         return self._fleet.has_fast_path and self._tolerated is not None
 
-    def look_ahead(self, ticks: Records, most: int) -> int:
-        """Fill in, for up to `most` ticks ahead, the data that fast steps need; `ticks` are records of DUE.
+    def look_ahead(self) -> bool:
+        """Fill in what fast steps need of the coming ticks; a step in Python invalidates it.
 
-        Returns the number of ticks that may be fast. A step in Python in between invalidates the rest.
+        Returns whether the next tick may be fast.
         """
-        next_ns, flying = self.next_tick_ns, self.phase is Phase.FLYING
+        time_s, flying = self.scenario_time_s(self.next_tick_ns), self.phase is Phase.FLYING
+        self._coming["quiet_until_ns"] = 0.0
         waiting = self._reception.touched or self._gone or self._returning
-        if waiting or not self._monitor.is_calm(self.scenario_time_s(next_ns), flying=flying):
-            return 0
+        if waiting or not self._monitor.is_calm(time_s, flying=flying):
+            return False
         if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
-            return 0
-        quiet_until_ns, longest_s = inf if flying else self._quiet_until_ns(), self._longest_phase_s
+            return False
+        scenario, clock_row = self.plan.scenario, -1 if flying else self._awaited_clock
+        quiet_until_ns = inf if flying else self._quiet_until_ns(awaits_clock=clock_row >= 0)
+        steady_until_s = min((new.from_s for new in scenario.nominal_velocity if new.from_s > time_s), default=inf)
+        self._coming[0] = (
+            flying, scenario.nominal_velocity_at(time_s), *self._journal.zero, self._phase_since_ns, quiet_until_ns,
+            self._longest_phase_s, steady_until_s, clock_row,
+        )  # fmt: skip
+        return quiet_until_ns > 0.0
 
-        def may_be_fast(place: int) -> bool:
-            due_ns = next_ns + place * self._period_ns
-            return due_ns < quiet_until_ns and self._waited_s(due_ns) < longest_s
-
-        count = most if may_be_fast(most - 1) else sum(map(may_be_fast, range(most)))
-        if not count:
-            return 0
-        times_s, scenario = self.scenario_time_s(next_ns + self._period_ns * np.arange(count)), self.plan.scenario
-        steady = len(scenario.nominal_velocity) == 1 and not scenario.course.is_smooth
-        velocities = [scenario.nominal_velocity_at(time_s) for time_s in times_s[: 1 if steady else count].tolist()]
-        ticks["flying"][:count], ticks["clock_row"][:count] = flying, -1 if flying else self._awaited_clock
-        ticks["time_s"][:count], ticks["velocity_ne_m_s"][:count] = times_s, velocities
-        return count
-
-    def _quiet_until_ns(self) -> float:
+    def _quiet_until_ns(self, *, awaits_clock: bool) -> float:
         """The time before which ticks outside the flight have nothing to do, if vehicles send only what kernels handle.
 
         0 if unknown; see also `_longest_phase_s`.
@@ -223,7 +223,7 @@ class Station:
             waits = not self._all_ended
         else:
             connects = self.phase is Phase.CONNECTING and not self._journal.stop
-            waits = connects and (self._awaited_clock >= 0 or any(vehicle.awaits_message for vehicle in self.vehicles))
+            waits = connects and (awaits_clock or any(vehicle.awaits_message for vehicle in self.vehicles))
         return min(vehicle.quiet_until_ns for vehicle in self.vehicles) if waits else 0
 
     @property
@@ -231,11 +231,11 @@ class Station:
         """The row of a vehicle that only `awaits_clock`; -1 if there is none."""
         return next((row for row, vehicle in enumerate(self.vehicles) if vehicle.awaits_clock), -1)
 
-    def unjudged(self, time_s: float, due_ns: int, indices: IntArray) -> Tick:
+    def unjudged(self, due_ns: int, indices: IntArray) -> Tick:
         """A tick whose set-points kernels have made; the arguments are fields of `Tick`."""
         self._journal.now_ns = self._columns["now_ns"][0]
         number = (due_ns - self._start_ns) // self._period_ns
-        return Tick(number, time_s, due_ns, self._key_ms(due_ns), None, indices)
+        return Tick(number, self.scenario_time_s(due_ns), due_ns, self._key_ms(due_ns), None, indices)
 
     def _judged_by_kernels(self, due_ns: int) -> Judged:
         """The results behind set-points that kernels have made."""
@@ -308,13 +308,13 @@ class Station:
     def _fast_tick(self, outgoing: Outbox) -> Tick | None:
         """Do the tick due now with a kernel if possible, else return None."""
         due_ns = self.next_tick_ns
-        if self.phase is not Phase.FLYING or not self.has_fast_path or not self.look_ahead(self._due, 1):
+        if self.phase is not Phase.FLYING or not self.has_fast_path or not self.look_ahead():
             return None
-        done, set_points = fast_set_points(self.fast_path_data, self._due)
+        done, set_points = fast_set_points(self.fast_path_data)
         if not done:
             return None
         indices = self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing)
-        return self.unjudged(self._due["time_s"].item(), due_ns, indices)
+        return self.unjudged(due_ns, indices)
 
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
