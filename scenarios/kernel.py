@@ -114,9 +114,13 @@ class _Kernel:
         )
         settings.CACHE_LOCATOR_CLASSES = "scenarios.kernel_cache.AnyClone"
         try:
-            compiled = compiler.njit(_nrt=self._makes_arrays, no_cfunc_wrapper=True, no_cpython_wrapper=not for_python)(
-                self._function
-            )
+            # inlined, as a call that passes a tuple copies every array in it, a tenth of a flight's time
+            compiled = compiler.njit(
+                _nrt=self._makes_arrays,
+                forceinline=True,
+                no_cfunc_wrapper=True,
+                no_cpython_wrapper=not for_python,
+            )(self._function)
             if folder is None:
                 _announce()
             else:
