@@ -69,7 +69,7 @@ LINK = np.dtype(
         ("first_heard_ns", "i8"),  # when the first one arrived, or 0
         ("launched", "?"),  # it has no autopilot: only changes of its heartbeats matter, and it has no global position
         ("heartbeat_ns", "i8"),  # when the newest heartbeat arrived
-        ("heartbeat", "u8"),  # the first 8 bytes of a heartbeat that would change nothing; 0: none
+        ("heartbeat", "i8"),  # `told_by` a heartbeat that would change nothing; 0: none
         ("newest", "?"),  # the last frame processed was sent after all the others
         ("told", "i8"),  # frame-order faults already reported, as bits 1 << LATE and 1 << DUPLICATE
         ("left_out", "?"),  # see `RemoteVehicle`
@@ -83,6 +83,19 @@ LINK = np.dtype(
     align=True,
 )
 """Per-vehicle state that every received or sent frame may change."""
+
+
+_KIND = 0xFFFF << 32
+"""Bits of `told_by`: the kinds of vehicle and autopilot."""
+
+
+@kernel
+def told_by(heartbeat: int) -> int:
+    """What the first 8 bytes of a heartbeat tell: custom mode, kinds, whether it is armed and whether it is critical.
+
+    Other modes and states follow from these, or concern nobody.
+    """
+    return heartbeat & 0x80FFFFFFFFFFFF | (heartbeat >> 56 & 0xFF == STATE_CRITICAL) << 56
 
 
 class Links(NamedTuple):
@@ -461,7 +474,7 @@ class RemoteVehicle:
         elif was_guided and not self.guided and not critical:
             self._report("vehicle", f"left {self.kind.guided_name}" if armed else "was disarmed", self.system_id)
         self.critical = critical
-        self._heartbeat = custom_mode | vehicle_type << 32 | autopilot << 40 | base_mode << 48 | system_status << 56
+        self._expect(vehicle_type << 32 | autopilot << 40)
 
     def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
         """Detect from a reported mode or arming that somebody else has taken the vehicle over, or handed it back.
@@ -524,7 +537,6 @@ class RemoteVehicle:
         if command == ARM_DISARM and self.startup.arming_refusals > 1:
             self._report("vehicle", f"arms after {self.startup.arming_refusals} refusals", self.system_id)
         self.startup.accepted(command, waiting.parameters, now_ns)
-        self._heartbeat = 0
         if command in (SET_MODE, ARM_DISARM):
             self._outdated.append((now_ns, self.custom_mode, self.armed))
         if command == SET_MODE:
@@ -532,6 +544,11 @@ class RemoteVehicle:
             self.critical = False
         elif command == ARM_DISARM:
             self.armed = waiting.parameters[0] == 1.0
+        self._expect(self._heartbeat & _KIND)
+
+    def _expect(self, kind: int) -> None:
+        """Note what a heartbeat tells that would change nothing, given its bits of `_KIND`."""
+        self._heartbeat = self.custom_mode | kind | self.armed << 55 | self.critical << 56
 
     def next_frame(self, now_ns: int) -> bytes | None:
         """The frame that is due to bring the vehicle to the wanted state, if any: a command, else a parameter.

@@ -29,7 +29,7 @@ from gcs.link.mavlink import (
     unsigned_at,
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
-from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns
+from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns, told_by
 from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
@@ -346,7 +346,8 @@ def _take_frame(
     elif msg_id == TIMESYNC:
         known = tc1_ns != 0 or link.launched  # a reply, or a request
     elif msg_id == HEARTBEAT:
-        same = link.heartbeat != 0 and unsigned_at(stream, payload, 8, payload_end) == link.heartbeat
+        told = told_by(int64(unsigned_at(stream, payload, 8, payload_end)))
+        same = link.heartbeat != 0 and told == link.heartbeat
         known = link.launched and same and received_ns - link.heartbeat_ns <= FORGET_NUMBERS_NS
     else:
         known = link.launched
