@@ -45,8 +45,8 @@ class Watched(NamedTuple):
     """Ticks of this flight so far, (1,)."""
     margins_s: FloatArray
     """The largest `Seen.loop_delay_s` that each gain set tolerates, (n, sets)."""
-    in_order: FloatArray
-    """Work array for sorting one vehicle's delays, (ticks,)."""
+    largest: FloatArray
+    """Work array for one vehicle's largest delays, (ticks,)."""
     changed: NDArray[np.int64]
     """Buffer for the rows that `judge` changes, (n,)."""
 
@@ -72,19 +72,20 @@ def _rank(seen: int) -> int:
 
 
 @kernel
-def _judged_delay_s(delays_s: Array, row: int, seen: int, in_order: Array) -> float:
-    """The delay by which a vehicle is judged: see `_rank`."""
-    known = 0
+def _judged_delay_s(delays_s: Array, row: int, seen: int, largest: Array) -> float:
+    """The delay by which a vehicle is judged: see `_rank`. Only the delays from there up are sorted, largest first."""
+    known, most = 0, seen - _rank(seen)
     for place in range(seen):
         delay_s = delays_s[row, place]
         if not isnan(delay_s):
-            later = known
-            while later > 0 and in_order[later - 1] > delay_s:
-                in_order[later] = in_order[later - 1]
+            later = min(known, most - 1)
+            while later > 0 and largest[later - 1] < delay_s:
+                largest[later] = largest[later - 1]
                 later -= 1
-            in_order[later] = delay_s
+            if known < most or largest[later] < delay_s:
+                largest[later] = delay_s
             known += 1
-    return in_order[_rank(seen)] if known > _rank(seen) >= 0 else nan
+    return largest[known - 1 - _rank(seen)] if known > _rank(seen) >= 0 else nan
 
 
 @kernel
@@ -115,7 +116,7 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
         if seen.flying:
             delays_s[row, place] = seen.loop_delay_s[row]
         if not separable:
-            delay_s = _judged_delay_s(delays_s, row, known, watched.in_order)
+            delay_s = _judged_delay_s(delays_s, row, known, watched.largest)
             delay_s = _scaled(delay_s, margins_s[row, 0], least_s)
             largest_s = nan if isnan(delay_s) or isnan(largest_s) else max(largest_s, delay_s)
     for row in range(len(states)):
@@ -123,7 +124,7 @@ def judge(watched: Watched, seen: Seen, policy: Policy, separable: bool) -> int:
         scaled_s = largest_s if separable else _scaled(largest_s, least_s, own_s[0])
         if seen.flying and _is_calm(state, seen, row, delays_s, known, separable, scaled_s, own_s, policy):
             continue
-        delay_s = _judged_delay_s(delays_s, row, known, watched.in_order) if separable else scaled_s
+        delay_s = _judged_delay_s(delays_s, row, known, watched.largest) if separable else scaled_s
         own = Observation(
             seen.time_s, seen.flying, seen.silent[row], seen.guided[row], seen.failsafe[row], delay_s
         )  # fmt: skip
@@ -195,7 +196,7 @@ class FormationMonitor:
         self._period_s = period_s
         self._delays_s = np.full((vehicles, max(1, round(policy.window_s / period_s))), nan)
         self._judged, self._changed = np.zeros(1, np.int64), np.zeros(vehicles, np.int64)
-        self._in_order = np.zeros(self._delays_s.shape[1])
+        self._largest = np.zeros(self._delays_s.shape[1])
         self.away: list[int] = []
         """The rows of the vehicles that do not follow commands."""
         self._troubled: list[int] = []
@@ -246,7 +247,7 @@ class FormationMonitor:
     @property
     def watched(self) -> Watched:
         return Watched(
-            self._states, self._after, self._delays_s, self._judged, self.margins_s, self._in_order, self._changed
+            self._states, self._after, self._delays_s, self._judged, self.margins_s, self._largest, self._changed
         )  # fmt: skip
 
     def is_calm(self, time_s: float, *, flying: bool) -> bool:
