@@ -13,7 +13,7 @@ def shorten(vectors: Array, longest: float) -> None:
     """Limit the horizontal parts of vectors (n, 2 or 3) to a length; directions are kept."""
     for row in range(len(vectors)):
         north, east = vectors[row, 0], vectors[row, 1]
-        size = hypot(north, east)
+        size = hypot(north, east) if abs(north) + abs(east) > longest else 0.0
         if size > longest:
             vectors[row, 0], vectors[row, 1] = north * longest / size, east * longest / size
 
