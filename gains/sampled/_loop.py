@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from math import inf
 from typing import Any, Protocol
 
@@ -119,11 +120,18 @@ def held_blocks(
     A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, measured: NDArray[Any] | None = None
 ) -> list[HeldPlant]:
     """The distinct strongly connected blocks of the loop, balanced, with B K of each factored at full rank."""
-    plants: list[HeldPlant] = []
-    for block in distinct_blocks(A, B @ K, np.eye(len(A)) if measured is None else np.diag(measured)):
+    return [*_blocks_of(HeldPlant(A, B, K, period_s, measured))]
+
+
+@lru_cache(maxsize=64)
+def _blocks_of(whole: HeldPlant) -> list[HeldPlant]:
+    """`held_blocks` of a loop as one block: the growth of one loop is asked for at many delays."""
+    measured, plants = whole.measured, list[HeldPlant]()
+    seen = np.ones(len(whole.A)) if measured is None else measured.astype(np.float64)
+    for block in distinct_blocks(whole.A, whole.B @ whole.K, np.diag(seen)):
         A_block, BK_block = balanced(*block.matrices[:2])
-        seen = None if measured is None else np.diag(block.matrices[2]) > 0.0
-        plants.append(HeldPlant(A_block, *factor_rank(BK_block), period_s, seen))
+        own = None if measured is None else np.diag(block.matrices[2]) > 0.0
+        plants.append(HeldPlant(A_block, *factor_rank(BK_block), whole.period_s, own))
     return plants
 
 
