@@ -72,10 +72,11 @@ def _needs_pair(trial: Trial) -> bool:
     It does on links that vary. It also does if vehicles have different links, and either share a loop or the probed
     vehicle's link is the one that the campaign varies.
     """
+    if trial.real_time or not has_constant_links(trial.scenario):
+        return not trial.real_time
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
-    coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
     alone = _is_varied(trial.probe, dict(trial.coordinates))
-    return not trial.real_time and (not has_constant_links(trial.scenario) or (len(links) > 1 and (coupled or alone)))
+    return len(links) > 1 and (alone or any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial))))
 
 
 def _is_varied(probe: int, coordinates: Mapping[str, float]) -> bool:
