@@ -279,12 +279,14 @@ class Fleet:
         """Bring up to date the vehicles that the kernel has left to Python."""
         for _, row in sorted(self._waiting[:count].tolist()):
             member = self._in_rows[row]
-            if self._columns["plain"][row]:
+            while self._columns["plain"][row]:
                 member.up.make_ready()
                 if run_at(*self._arrays(), row, now_ns):
-                    continue
-            self._catch_up(member, now_ns)
-            self._plan(member)
+                    break
+                self._catch_up(member, min(self._columns["acts_ns"][row], member.down.next_due_ns))  # one event
+            else:
+                self._catch_up(member, now_ns)
+                self._plan(member)
 
     def _begin(self, data: bytes, time_ns: int) -> None:
         """Begin the flight of a leader flown by somebody else, at the station's first set-point."""
