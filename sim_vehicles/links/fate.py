@@ -24,8 +24,8 @@ form a ring buffer: one is refilled while part of the other is left."""
 DRAW = np.dtype(
     [
         ("burst", "f8"), ("loss", "f8"), ("duplicate", "f8"), ("corrupt", "f8"),
-        ("flips", "f8", (MOST_FLIPS,)),  # where bits are flipped; `corrupt` also says how many are used
         ("jitter_ns", "i8"), ("duplicate_jitter_ns", "i8"),
+        ("flips", "f8", (MOST_FLIPS,)),  # where bits are flipped; `corrupt` also says how many are used
     ]
 )  # fmt: skip
 """The random draws of one datagram: uniform in [0, 1), except the jitter."""
