@@ -221,7 +221,7 @@ class FormationMonitor:
                 self._after[row] = after
             if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                 changes.append((row, before, after))
-        settle(self.watched)
+        self._states[:] = self._after
         if changed:
             self.away, self._troubled, self._settled_s = self._rows(_AWAY), self._rows(_TROUBLED), inf
         self._open(seen.time_s, flying=seen.flying)
