@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gcs.control.tick import Mode
 from gcs.station.modes import STATE, Observation, VehicleState, next_state, policy_of
-from gcs.station.monitor import FormationMonitor, Seen
+from gcs.station.monitor import FormationMonitor, Seen, _judged_delay_s  # pyright: ignore[reportPrivateUsage]
 from scenarios.kernel import at_row
 from scenarios.schema import Monitor
 
@@ -171,6 +171,13 @@ def test_invariants_hold_for_any_history(history: list[tuple[float, bool, bool]]
             assert recovered or now_s - last_change_s >= POLICY.blend_s
             assert recovered or abs(state.gain_set - before.gain_set) == 1
             last_change_s = now_s
+
+
+@given(st.lists(st.floats(0.0, 1.0) | st.just(nan), min_size=1, max_size=50))
+def test_the_judged_delay_is_the_90th_percentile_with_unknown_ones_as_the_longest(delays_s: list[float]) -> None:
+    judged_s = _judged_delay_s(np.array([delays_s]), 0, len(delays_s), np.zeros(50))
+    wanted_s = np.sort(delays_s)[min(len(delays_s) - 1, int(0.9 * len(delays_s)))]
+    assert judged_s == wanted_s or (np.isnan(judged_s) and np.isnan(wanted_s))
 
 
 def formation(n: int, *, separable: bool = True) -> FormationMonitor:

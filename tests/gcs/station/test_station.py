@@ -1,5 +1,6 @@
 """The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
 
+import struct
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import pytest
 
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.startup import WITHOUT_TARGET
+from gcs.link.vehicle import told_by
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.station.station import Station
@@ -102,6 +104,22 @@ def test_a_heartbeat_of_zeros_is_not_taken_for_one_that_changes_nothing() -> Non
     assert vehicle.armed
     station.step([peer.datagram(peer.link.heartbeat_encode(0, 0, 0, 0, 0), S + 30 * MS)], S + 40 * MS)
     assert (vehicle.armed, vehicle.custom_mode) == (False, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "matters"),
+    [
+        ("custom_mode", 5, True), ("type", 1, True), ("autopilot", 4, True), ("base_mode", 1, True),
+        ("base_mode", 128 | 64, False), ("system_status", 5, True), ("system_status", 3, False),
+    ],
+)  # fmt: skip
+def test_a_heartbeat_tells_of_modes_kinds_arming_and_failsafe(name: str, value: int, matters: bool) -> None:
+    fields = {"custom_mode": 4, "type": 2, "autopilot": 3, "base_mode": 129, "system_status": 4}
+    one, other = (
+        told_by(int.from_bytes(struct.pack("<IBBBB", *each.values()), "little"))
+        for each in (fields, fields | {name: value})
+    )
+    assert (one != other) == matters
 
 
 def test_reordered_or_repeated_frames_are_no_refusals_and_told_once() -> None:
