@@ -19,7 +19,6 @@ from gains.performance.radii import SectorLoop, Worst
 from gcs.drive.flown import first_uses, fly_plan, median_delays_s
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.formation import on_one_axis
 from gcs.published import Published
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import LINEAR_COMMAND_M_S2, linear_error_m_s, linear_until_s, probe_scenario
@@ -162,10 +161,9 @@ def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, co
 
     Raises InputError if gains differ between north and east, or couple them.
     """
-    narrow = on_one_axis(plan.model, plan.gain)
-    if narrow is None:
+    model, K = plan.model.narrowed(plan.gain)
+    if model.axes > 1:
         raise InputError("gains: read gains that differ north and east, wanted the same on both with --disturbance")
-    model, K = narrow
     T = plan.timing.control_s
     formation = DisturbedFormation(model, model.A, model.B, K, T, delay_s, assumed_s=plan.assumed_s)
     found: list[Case] = []
