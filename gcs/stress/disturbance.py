@@ -227,8 +227,9 @@ def _onset(
     if not sizes:
         missing = "no disturbance of this kind breaks the formation"
     elif not points:
-        far = "" if linear else f", which left the linear range: {_linear_range_text(probe)}"
-        missing = f"no growth rate in {len(sizes)} flights{far}"
+        span = f"velocity errors up to {linear_error_m_s(probe):g} m/s, commands up to {LINEAR_COMMAND_M_S2:g} m/s²"
+        missing = f"no growth rate in {len(sizes)} flights"
+        missing += "" if linear else f", which left the linear range: {span}"
     elif onset is None:
         missing = f"growth did not pass zero in {len(sizes)} flights with {min(sizes):.5f} to {max(sizes):.5f} 1/s"
     return DisturbanceOnset(
@@ -243,10 +244,6 @@ def _onset(
         measured=len(points),
         missing=missing,
     )
-
-
-def _linear_range_text(probe: Scenario) -> str:
-    return f"velocity errors up to {linear_error_m_s(probe):g} m/s, commands up to {LINEAR_COMMAND_M_S2:g} m/s²"
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> tuple[list[GrowthPoint], bool]:
