@@ -124,8 +124,8 @@ class FrontSearch:
             gains = replace(self._graph, delay_s=delay_s, timing=timing)
             return PredictedPattern(gains) if route.predicted else gains, gains.gain
         tree = TreeGains(delay_s, timing, response=self.response)
-        predicted = PredictedTree(delay_s, self.period_s, tolerated=self.tolerated, response=self.response)
-        return predicted if route.predicted else tree, lambda point: tree.gains(point).gain_of(self._single)
+        family = PredictedTree(tree, tolerated=self.tolerated) if route.predicted else tree
+        return family, lambda point: tree.gains(point).gain_of(self._single)
 
     def _point(self, route: Route, delay_s: float, K: FloatArray, found: Figures) -> FrontPoint:
         single, response = self._single, self.response

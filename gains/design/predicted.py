@@ -93,10 +93,10 @@ def predicted_gains(
     criteria = wanted.criteria
     assert criteria is not None
     assert criteria.at_delay_s is not None
-    family = PredictedTree(criteria.at_delay_s, period_s, at_s, criteria.weight, _tolerated(criteria), response)
+    tree = TreeGains(criteria.at_delay_s, FlownTiming(inf, period_s), criteria.weight, response=response)
     evaluations = _EVALUATIONS if response is None else _EVALUATIONS_RESPONSE
-    point, figures = searched(family, wanted, evaluations=evaluations)
-    return replace(family.tree.gains(point), alpha=figures.alpha_at_delay)
+    point, figures = searched(PredictedTree(tree, at_s, _tolerated(criteria)), wanted, evaluations=evaluations)
+    return replace(tree.gains(point), alpha=figures.alpha_at_delay)
 
 
 def _tolerated(criteria: Criteria) -> float:
@@ -108,36 +108,30 @@ def _tolerated(criteria: Criteria) -> float:
 
 @dataclass(frozen=True)
 class PredictedTree:
-    """The gain family `TreeGains` (k1, k2 and k3 of a vehicle behind another) with prediction."""
+    """The gain family `TreeGains` (k1, k2 and k3 of a vehicle behind another) with prediction over its delay."""
 
-    assumed_s: float
-    period_s: float
+    tree: TreeGains
     at_s: Sequence[float] | None = None
-    weight: tuple[float, float] | None = None
     tolerated: float = _TOLERATED
-    response: Response | None = None
     step: float = 0.2
 
     @property
-    def tree(self) -> TreeGains:
-        """The same gains without prediction."""
-        return TreeGains(self.assumed_s, FlownTiming(inf, self.period_s), response=self.response)
-
-    @property
     def starts(self) -> Sequence[FloatArray]:
+        assert self.tree.delay_s is not None
         # the window is about 1 / (k1 + k3 tau^) to either side; a double root decays fastest; the largest alpha with a
         # string peak of 1 is near k3 = 0.45 k1^2, k2 = 0.27 k1
         found: list[FloatArray] = []
         for share, front, ratio in ((0.9, 0.3, 0.25), (0.6, 0.3, 0.25), (0.3, 0.3, 0.25), (1.0, 0.27, 0.45)):
-            k1 = (sqrt(1.0 + 4.0 * ratio / self.tolerated) - 1.0) / (2.0 * ratio * self.assumed_s)
+            k1 = (sqrt(1.0 + 4.0 * ratio / self.tolerated) - 1.0) / (2.0 * ratio * self.tree.delay_s)
             found.append(np.array([log(share * k1 * self.tree.late_s), front, log(ratio)]))
         return found
 
     def figures(self, point: FloatArray) -> PredictedFigures:
-        K, at_s = self.tree.gains(point).K, (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
-        return PredictedFigures(
-            PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED, self.response
-        )
+        own = self.tree
+        assert own.delay_s is not None
+        K, period_s = own.gains(point).K, own.timing.period_s
+        at_s = (own.delay_s,) if self.at_s is None else tuple(self.at_s)
+        return PredictedFigures(PAIR, K, period_s, own.delay_s, at_s, own.weight, True, _THINNED, own.response)
 
 
 @dataclass(frozen=True, eq=False)

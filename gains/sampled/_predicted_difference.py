@@ -33,8 +33,8 @@ _SMALL = 0.95
 # largest relative change of det(I - N) between neighbouring angles; parts into which an interval is divided to meet it;
 # most such refinements; the modulus that replaces zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
-# least singular value of I - N, beside its terms, up to which it is rounding; refinements before it is looked at
-ROUNDING, _USUAL = 1e-14, 3
+# least singular value of I - N, beside its terms, up to which it is rounding; refinements before it is computed
+ROUNDING, _UNCHECKED = 1e-14, 3
 
 
 class Grid(NamedTuple):
@@ -214,7 +214,7 @@ class PredictedDifference:
             of = np.repeat(changing, [own.size for own in between.values()])
             grid, own = self.at(np.concatenate([*between.values()])), answers.of(of)
             added = self.determinants(grid, own)
-            if refinement >= _USUAL:
+            if refinement >= _UNCHECKED:
                 added[self.least_singular(grid, own) <= ROUNDING] = np.nan
             for k in changing:
                 angle = np.concatenate([found[k][0], between[k]])

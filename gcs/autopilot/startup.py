@@ -4,13 +4,13 @@ The origin's latitude and longitude come from GPS_GLOBAL_ORIGIN; from HOME_POSIT
 both frames; or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
 """
 
-from math import cos, degrees, isfinite, radians
+from math import cos, degrees, isfinite, nan, radians
 from typing import Any
 
-from gcs.autopilot.kinds import ARM, HAS_LANDED, WAS_DISARMED, Seen, kind_of, next_step
+from gcs.autopilot.kinds import HAS_LANDED, WAS_DISARMED, kind_of
 from gcs.autopilot.vehicle_limits import ReportedLimits
 from gcs.link import mavlink
-from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
+from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step, mode_command
 from gcs.link.startup import OPTIONAL, Startup, message_rates
 from gcs.link.vehicle import ARMED
 
@@ -22,6 +22,10 @@ _TAKE_OFF_S, _SLOWEST_CLIMB_M_S = 15.0, 0.5
 """Timeout of a take-off: this long plus the climb at this rate. Then it is commanded again or, if the vehicle has left
 the ground, set-points lead it to its altitude."""
 _LEFT_GROUND_M = 2.0
+_ARM = ARM_DISARM, (1.0,)
+_POSITION_FLAGS, _CONSTANT_POSITION = 0x08 | 0x10, 0x80
+"""Estimator flags: horizontal position known, relative and absolute; position only assumed. The bits are the same in
+EKF_STATUS_REPORT and ESTIMATOR_STATUS."""
 _STANDBY = 3
 """MAV_STATE of a vehicle on the ground; ArduCopter reports it there even while armed."""
 _OLD_MS = 1000
@@ -192,34 +196,53 @@ class AutopilotStartup(Startup):
         return self.limits.next(self.kind, now_ns, target_system=target_system, rtt_ns=rtt_ns)
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
+        """The next step of the start-up; a vehicle found in the air continues from there.
+
+        All need rates, clock and position. ArduCopter then becomes guided, is armed and takes off; PX4 is armed, takes
+        off and becomes guided (OFFBOARD) once set-points arrive. One that stays disarmed gets no mode or arming
+        command.
+        """
         if self.kind is UNRECOGNISED:
             return Step(self.refusal or "sends no heartbeat of an autopilot")
-        due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
         patience_ns = (_TAKE_OFF_S + self.altitude_m / _SLOWEST_CLIMB_M_S) * 1e9
         took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
         # A vehicle found in the air takes set-points at once; during a take-off, they would end the climb too early.
         enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if took_off else _LEFT_GROUND_M
         is_up = self.airborne or (self.relative_altitude_m or 0.0) > enough_m
         self.airborne = armed and is_up and not self.stays_disarmed
-        seen = Seen(
-            interval_due=due,
-            clock_known=clock_known,
-            position_heard=self._local is not None,
-            estimator_flags=self._flags,
-            origin_known=self.origin is not None,
-            custom_mode=custom_mode,
-            armed=armed,
-            stays_disarmed=self.stays_disarmed,
-            took_off=took_off,
-            airborne=self.airborne,
-            relative_altitude_m=self.relative_altitude_m,
-            sea_level_m=self._sea_level_m,
+        due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
+        if lacks := self._lacks(due, clock_known=clock_known):
+            return Step(lacks, None if due is None else (SET_MESSAGE_INTERVAL, due))
+        guided = custom_mode == self.kind.guided_mode
+        if not guided and (self.kind.guided_first or self.airborne):
+            return Step(f"does not enter {self.kind.guided_name}", mode_command(self.kind, self.kind.guided_mode))
+        if not armed:
+            why = f": {self._text}" if self._text else ""
+            refused = f", refused {self.arming_refusals} times{why}" if self.arming_refusals else ""
+            return Step(f"does not arm{refused}", _ARM)
+        if not took_off and not self.airborne:
+            # PX4 would fly to a finite latitude, longitude and yaw; NaN keeps the present ones.
+            above_sea = 0.0, 0.0, 0.0, nan, nan, nan, self.altitude_m + self._sea_level_m
+            above_home = (0.0,) * 6 + (self.altitude_m,)
+            return Step("does not take off", (TAKE_OFF, above_sea if self.kind.altitude_above_sea else above_home))
+        climbs = f"climbs to {self.altitude_m:g} m, is at {self.relative_altitude_m or 0.0:.1f} m"
+        return Step("" if self.airborne else climbs)
+
+    def _lacks(self, due: tuple[float, float] | None, *, clock_known: bool) -> str:
+        """What the vehicle lacks before it may be guided and armed; empty if nothing. `due` is a rate not accepted."""
+        flags = self._flags
+        has_position = (flags or 0) & (_POSITION_FLAGS | _CONSTANT_POSITION) == _POSITION_FLAGS
+        lacks = (
+            (f"does not accept the rate of message {due[0] if due else 0:.0f}", due is not None),
+            (self.stays_disarmed, self.stays_disarmed != ""),
+            ("does not answer TIMESYNC", not clock_known),
+            (f"sends no estimator status (message {self.kind.estimator_message})", flags is None),
+            (f"has no position yet (estimator flags 0x{flags or 0:x})", not has_position),
+            ("sends no LOCAL_POSITION_NED", self._local is None),
+            ("sends no GLOBAL_POSITION_INT", self.relative_altitude_m is None),
+            ("does not say where its local origin is", self.origin is None),
         )
-        step = next_step(self.kind, seen, altitude_m=self.altitude_m)
-        if step.command != ARM or not self.arming_refusals:
-            return step
-        why = f": {self._text}" if self._text else ""
-        return step._replace(missing=f"{step.missing}, refused {self.arming_refusals} times{why}")
+        return next((text for text, lacking in lacks if lacking), "")
 
 
 def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:

@@ -24,7 +24,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from gcs.plan.loops import link_delays_left_s
 from gcs.plan.mismatch import Tolerated
-from gcs.plan.own_law import code_by_key
+from gcs.plan.own_law import code_by_key, law_formation
 from gcs.published import Published
 from scenarios.schema import Scenario
 
@@ -136,14 +136,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     scenario, formation, model = plan.scenario, plan.formation, plan.model
     ordered = scenario.leader_first()
     place = formation.place_ne_m()
-    errors = np.zeros(model.states)
-    for row, vehicle in enumerate(ordered):
-        velocity = np.array(vehicle.velocity_ne_m_s)
-        errors[model.velocity_slice(row)] = velocity - scenario.nominal_velocity_at(0.0)
-        if row > 0:
-            ahead = ordered[model.predecessors[row]]
-            apart = np.array(ahead.position_ne_m) - vehicle.position_ne_m
-            errors[model.spacing_slice(row)] = apart + formation.offset_ne_m[row]
+    states = np.array([(*vehicle.position_ne_m, *vehicle.velocity_ne_m_s) for vehicle in ordered])
+    errors = law_formation(formation, scenario.nominal_velocity_at(0.0), plan.timing.control_s).errors(states)
     commands = plan.gain @ errors
     delays_s, effective_s, drawn, use = _delays(plan)
     limits = scenario.limits

@@ -48,10 +48,12 @@ class Presence:
         Raises InputError if they fly another scenario, do not say which, or do not obey.
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
-        there = sorted(self._addresses)
-        said = self._ask(
-            there, mavlink.PARAM_EXT_REQUEST_READ, partial(mavlink.param_request_read, mavlink.SCENARIO), _scenario_of
-        )
+
+        def scenario(frame: mavlink.Frame) -> str:
+            return mavlink.scenario_of(frame.fields) if frame.msg_id == mavlink.PARAM_EXT_VALUE else ""
+
+        there, fields = sorted(self._addresses), partial(mavlink.param_request_read, mavlink.SCENARIO)
+        said = self._ask(there, mavlink.PARAM_EXT_REQUEST_READ, fields, scenario)
         for system_id in there:
             if (text := said.get(system_id, "")).split(" ")[0] != fingerprint(self._scenario):
                 raise InputError(self._refusal(there, self._flown(text)))
@@ -132,7 +134,3 @@ class Presence:
             f"{who} at {host}:{port} {flown}, wanted vehicles of this same scenario or none: wait (those of a killed "
             f"station end within a minute), use --listen with another port, or fly them with --connect {host}:{port}"
         )
-
-
-def _scenario_of(frame: mavlink.Frame) -> str:
-    return mavlink.scenario_of(frame.fields) if frame.msg_id == mavlink.PARAM_EXT_VALUE else ""

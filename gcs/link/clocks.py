@@ -145,17 +145,6 @@ class ClockEstimate(NamedTuple):
     bound_ns: int
     reference_ns: int
 
-    def offset_at_ns(self, time_ns: int) -> int:
-        return offset_at_ns(self, time_ns)
-
-    def bound_at_ns(self, time_ns: int) -> float:
-        """The largest error, near a station time, of the offset or of an instant from `to_station_ns`."""
-        return bound_at_ns(self, time_ns)
-
-    def to_station_ns(self, boot_ns: int) -> int:
-        """The station's time at an instant of the vehicle's boot clock."""
-        return to_station_ns(self, boot_ns)
-
 
 class Limits(NamedTuple):
     """Limits of the offset, each with the time at which it holds; away from that time they widen by DRIFT_BOUND."""
@@ -173,11 +162,13 @@ def offset_at_ns(known: ClockEstimate, time_ns: int) -> int:
 
 @kernel
 def bound_at_ns(known: ClockEstimate, time_ns: int) -> float:
+    """The largest error, near a station time, of the offset or of an instant from `to_station_ns`."""
     return known.bound_ns + (DRIFT_BOUND + abs(known.skew)) * abs(time_ns - known.reference_ns)
 
 
 @kernel
 def to_station_ns(known: ClockEstimate, boot_ns: int) -> int:
+    """The station's time at an instant of the vehicle's boot clock."""
     first = boot_ns - known.offset_ns
     return first - round(known.skew * (first - known.reference_ns))
 
@@ -619,16 +610,12 @@ class VehicleClock:
         """Record a request sent now; returns its ts1, unique among the pending requests."""
         return _request_at(self._clocks.known, self._row, self._clocks.pending_ns[self._row], now_ns)
 
-    def boot_ns(self, boot_ms: int, near_ns: int) -> int:
-        """A time_boot_ms received near a station time, as an instant of the vehicle's clock with wraps undone."""
-        return boot_ns_of(self.estimate, boot_ms, near_ns)
-
     def station_ns(self, boot_ms: int, received_ns: int) -> int | None:
         """A time_boot_ms in station time, without using it to judge the clock; None while the clock is unknown."""
         if not self.samples:
             return None
         known = self.estimate
-        return min(received_ns, known.to_station_ns(boot_ns_of(known, boot_ms, received_ns)))
+        return min(received_ns, to_station_ns(known, boot_ns_of(known, boot_ms, received_ns)))
 
     def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
         """The station's time at which a state was sampled; None if it is unknown or impossible."""

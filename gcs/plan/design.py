@@ -3,6 +3,7 @@
 `gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
 """
 
+from collections.abc import Sequence
 from math import inf, nan
 from typing import Annotated, Literal, Self
 
@@ -352,3 +353,13 @@ class Design(Published):
         first = schedule[0]
         margins = {"delay_margin_s": first.delay_margin_s, "delay_margin_continuous_s": first.delay_margin_continuous_s}
         return self.model_copy(update=margins | {"schedule": schedule} | parts)
+
+    def with_margins(
+        self, sampled_s: Sequence[float], continuous_s: Sequence[float | None], **parts: Published | str
+    ) -> Self:
+        """The design with other margins of the gain schedule, and with other parts."""
+        every = (
+            entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
+            for entry, own_s, late_s in zip(self.schedule, sampled_s, continuous_s, strict=True)
+        )
+        return self.with_schedule(tuple(every), **parts)

@@ -21,7 +21,7 @@ from gains.performance.robust import disturbance_bound
 from gcs.plan.design import Design, PredictedSpread, VehicleSpread, WholeFigures
 from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.formation import Formation, on_one_axis, plan_formation
+from gcs.plan.formation import Formation, plan_formation
 from scenarios.schema import Scenario
 
 _MOST_WHOLE = 50
@@ -118,10 +118,9 @@ def _whole(design: Design, plan: FlightPlan, delay_s: float) -> WholeFigures | N
         or design.response is not None
     ):
         return None
-    narrow = on_one_axis(plan.model, plan.gain)
-    if narrow is None:
+    model, one = plan.model.narrowed(plan.gain)
+    if model.axes > 1:
         return None
-    model, one = narrow
     flown = DisturbedFormation(model, model.A, model.B, one, plan.timing.held_s, delay_s, assumed_s=plan.assumed_s)
     stable = flown.decay_1_s() > 0.0
     loop = SectorLoop(flown, tuple(range(model.states)))

@@ -40,9 +40,3 @@ def plan_formation(scenario: Scenario) -> Formation:
         north, east = scenario.nominal_velocity_at(0.0)
         offset_m = offset_m @ np.array([[north, east], [-east, north]]) / np.hypot(north, east)
     return Formation(tuple(row), model, offset_m)
-
-
-def on_one_axis(model: FormationModel, K: FloatArray) -> tuple[FormationModel, FloatArray] | None:
-    """The formation and the gain of one axis; None if K does not act on every axis alike."""
-    narrow, one = model.narrowed(K)
-    return (narrow, one) if narrow.axes == 1 else None

@@ -140,7 +140,7 @@ def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan
     if flown is plan:
         return design, plan
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
-    over_links = design.with_schedule(_with_margins(design, flown.margins_s, continuous_s))
+    over_links = design.with_margins(flown.margins_s, continuous_s)
     return _with_own_margins(over_links.model_copy(update={"margin_over_links": True}), flown), flown
 
 
@@ -207,7 +207,7 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
         return described(whole, plan), plan
     margins_s = tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
     continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
-    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan.with_margins(margins_s, None)
+    return whole.with_margins(margins_s, continuous_s), plan.with_margins(margins_s, None)
 
 
 def identified(design: Design, plan: FlightPlan) -> Design:
@@ -232,8 +232,8 @@ def identified(design: Design, plan: FlightPlan) -> Design:
         ),
         delay_margin_at_once_s=design.delay_margin_s,
     )
-    schedule = _with_margins(design, plan.margins_s, [None] * len(plan.gains))
-    return design.with_schedule(schedule, response=response).model_copy(update={"at_loop_delay": None})
+    known = design.with_margins(plan.margins_s, [None] * len(plan.gains), response=response)
+    return known.model_copy(update={"at_loop_delay": None})
 
 
 def described(design: Design, plan: FlightPlan) -> Design:
@@ -248,17 +248,7 @@ def described(design: Design, plan: FlightPlan) -> Design:
         fed = design.feed_forward
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
-    schedule = _with_margins(design, plan.margins_s, continuous_s)
-    return with_figures_at_delay(known.with_schedule(schedule, response=response), plan)
-
-
-def _with_margins(
-    design: Design, sampled_s: Sequence[float], continuous_s: Sequence[float | None]
-) -> tuple[GainSet, ...]:
-    return tuple(
-        entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
-        for entry, own_s, late_s in zip(design.schedule, sampled_s, continuous_s, strict=True)
-    )
+    return with_figures_at_delay(known.with_margins(plan.margins_s, continuous_s, response=response), plan)
 
 
 def _entry(time_scale: float, found: InclusionDesign | GraphDesign, **gains: Sequence[GainBlock]) -> GainSet:

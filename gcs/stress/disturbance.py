@@ -19,7 +19,6 @@ from gains.performance.radii import SectorLoop, Worst
 from gcs.drive.flown import first_uses, fly_plan, median_delays_s
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.formation import on_one_axis
 from gcs.published import Published
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import LINEAR_COMMAND_M_S2, linear_error_m_s, linear_until_s, probe_scenario
@@ -162,10 +161,9 @@ def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, co
 
     Raises InputError if gains differ between north and east, or couple them.
     """
-    narrow = on_one_axis(plan.model, plan.gain)
-    if narrow is None:
+    model, K = plan.model.narrowed(plan.gain)
+    if model.axes > 1:
         raise InputError("gains: read gains that differ north and east, wanted the same on both with --disturbance")
-    model, K = narrow
     T = plan.timing.control_s
     formation = DisturbedFormation(model, model.A, model.B, K, T, delay_s, assumed_s=plan.assumed_s)
     found: list[Case] = []
@@ -229,8 +227,9 @@ def _onset(
     if not sizes:
         missing = "no disturbance of this kind breaks the formation"
     elif not points:
-        far = "" if linear else f", which left the linear range: {_linear_range_text(probe)}"
-        missing = f"no growth rate in {len(sizes)} flights{far}"
+        span = f"velocity errors up to {linear_error_m_s(probe):g} m/s, commands up to {LINEAR_COMMAND_M_S2:g} m/s²"
+        missing = f"no growth rate in {len(sizes)} flights"
+        missing += "" if linear else f", which left the linear range: {span}"
     elif onset is None:
         missing = f"growth did not pass zero in {len(sizes)} flights with {min(sizes):.5f} to {max(sizes):.5f} 1/s"
     return DisturbanceOnset(
@@ -245,10 +244,6 @@ def _onset(
         measured=len(points),
         missing=missing,
     )
-
-
-def _linear_range_text(probe: Scenario) -> str:
-    return f"velocity errors up to {linear_error_m_s(probe):g} m/s, commands up to {LINEAR_COMMAND_M_S2:g} m/s²"
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> tuple[list[GrowthPoint], bool]:

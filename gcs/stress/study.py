@@ -211,13 +211,6 @@ def _flown(trials: list[Trial], run: Run) -> dict[str, Outcome]:
     return {outcome.id: outcome for outcome in outcomes}
 
 
-def _unreached(zero: Zero, waiting_s: float, *, shorter: bool) -> NoOnset:
-    """That waiting alone takes longer than the loop delay of the onset."""
-    what = _NONE_SHORT if shorter else _AT_ONCE
-    at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
-    return NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
-
-
 def _not_located(flights: Sequence[Outcome], scattered: Zero | None, *, shorter: bool) -> NoOnset:
     flown_s = [outcome.link_delay_s or 0.0 for outcome in flights]
     count = f"{len(flights)} flight{'s' * (len(flights) != 1)}"
@@ -287,10 +280,6 @@ def curve_error(outcomes: Sequence[Outcome]) -> float | None:
     return float(np.abs(measured - predicted).max()) / spread if spread > 0.0 else None
 
 
-def _median(known: Sequence[float]) -> float | None:
-    return float(np.median(known)) if known else None
-
-
 def _waits_s(outcomes: Sequence[Outcome]) -> list[float]:
     return [o.loop_delay_s - o.link_delay_s for o in outcomes if o.loop_delay_s and o.link_delay_s is not None] or [0.0]
 
@@ -323,7 +312,9 @@ def _found(
 ) -> Onset:
     waiting_s = _waiting_s(near)
     if zero.varied < waiting_s:
-        raise _unreached(zero, waiting_s, shorter=shorter)
+        what = _NONE_SHORT if shorter else _AT_ONCE
+        at = f"{zero.varied:.3f} s ± {zero.error:.3f} s of loop delay"
+        raise NoOnset(f"{what}: growth passes zero at {at}, and waiting alone takes {waiting_s:.3f} s")
     study, vehicle, blocks = slowed.study, slowed.vehicle, plan_loops(slowed.study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.varied))
     assert nearest.probed is not None
@@ -352,6 +343,7 @@ def _found(
     own = run([study.trial("own", slowed.at(delay_s), seed=seed) for delay_s in beside_s])
     links = () if vehicle is None else study.plan.scenario.link_of(vehicle)
     waits_s = _waits_s(near)
+    frequencies = [outcome.frequency_rad_s for outcome in near if outcome.frequency_rad_s is not None]
     critical = nearest.critical if vehicle is None else vehicle
     return Onset(
         loop_delay_s=zero.varied,
@@ -364,7 +356,7 @@ def _found(
         waiting_s=waiting_s,
         waits_for=_waits_for(study.plan.scenario, critical),
         slope_1_s2=zero.slope,
-        frequency_rad_s=_median([o.frequency_rad_s for o in near if o.frequency_rad_s is not None]),
+        frequency_rad_s=float(np.median(frequencies)) if frequencies else None,
         probed=nearest.probed,
         critical=critical,
         rounds=rounds,

@@ -19,9 +19,10 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gcs.drive.sitl import VehicleProcess
 from gcs.published import Published
+from gcs.runs.files import write_scenario
+from gcs.runs.record import SCENARIO_FILE
 from gcs.studies.benchmark import GAINS, benchmark, decode_s, encode_s, with_vehicles, without_solver
 from gcs.studies.compare_cost import timed
-from scenarios.files import dump
 from scenarios.schema import Scenario
 
 SIZES = (5, 20, 100)
@@ -175,8 +176,8 @@ def _fly_closed_loop(script: str, scenario: Scenario, vehicles: int, seconds: fl
     flown = without_solver(with_vehicles(scenario, vehicles), seconds)
     with tempfile.TemporaryDirectory(prefix="peers-") as name:
         folder = Path(name)
-        file = folder / "flown.toml"
-        file.write_text(dump(flown), encoding="utf-8")
+        write_scenario(folder, flown)
+        file = folder / SCENARIO_FILE
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             host, port = probe.getsockname()

@@ -17,14 +17,13 @@ from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.link import mavlink
 from gcs.plan.design import LinkPart
+from gcs.runs.files import write_scenario
 from gcs.runs.record import SCENARIO_FILE
 from gcs.watch.for_link import delays_of
 from gcs.watch.links import Requests, Watch
 from gcs.watch.live import watch_links
 from gcs.watch.saved_links import LinkRecorder
-from scenarios.files import dump
 from scenarios.networks import network_of
-from scenarios.own_code import write_code
 from scenarios.schema import NS_PER_S, Scenario
 
 MEASURED_S = 5.0
@@ -73,8 +72,7 @@ def measured_now(
         started: VehicleProcess | None = None
         if start_vehicles:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="links-")))
-            (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
-            write_code(scenario, folder)
+            write_scenario(folder, scenario)
             started = VehicleProcess(folder / SCENARIO_FILE, station=link.address, folder=folder, key_file=key_file)
             stack.enter_context(started)
 

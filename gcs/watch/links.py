@@ -23,7 +23,7 @@ import numpy as np
 
 from gcs.control.loop_delay import headroom, loop_delay_s, repeated_since_s
 from gcs.link import mavlink
-from gcs.link.clocks import UNANSWERED, UNANSWERED_NS
+from gcs.link.clocks import UNANSWERED, UNANSWERED_NS, boot_ns_of, bound_at_ns, offset_at_ns, to_station_ns
 from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
@@ -141,7 +141,7 @@ class WatchedVehicle:
         """Take in a position report. Once local positions arrive, only they count, because formations fly by them."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
-        boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
+        boot_ns = boot_ns_of(self.remote.clock.estimate, frame.fields[0], received_ns)
         if frame.msg_id != self._kind or (self.states and boot_ns == self.boot_ns):
             return
         if boot_ns < self.boot_ns < boot_ns + NS_PER_S and not self.remote.newest:
@@ -197,7 +197,7 @@ class WatchedVehicle:
                 repeated_s = repeated_since_s(self._rates, self.state_ns, now_ns, interval_ns)
             sampled_ns = self.boot_ns + self.least_delay_ns
             if clock.samples:
-                sampled_ns = clock.estimate.to_station_ns(self.boot_ns)
+                sampled_ns = to_station_ns(clock.estimate, self.boot_ns)
                 down_s = clock.down_ns * 1e-9 if clock.down_ns is not None and self.exchanges(now_ns) else nan
             age_s = (now_ns - sampled_ns) * 1e-9
             if clock.samples and clock.exchange_due:  # the state is of a clock that may have started anew
@@ -237,8 +237,8 @@ class WatchedVehicle:
             clock=Clock(
                 status="unknown" if known is None else "measured",
                 samples=len(self.rtt_s),
-                offset_s=None if known is None else known.offset_at_ns(now_ns) * 1e-9,
-                bound_s=None if known is None else known.bound_at_ns(now_ns) * 1e-9,
+                offset_s=None if known is None else offset_at_ns(known, now_ns) * 1e-9,
+                bound_s=None if known is None else bound_at_ns(known, now_ns) * 1e-9,
                 skew_ppm=None if known is None else round(known.skew * 1e6, 3),
                 jumps=clock.jumps,
             ),

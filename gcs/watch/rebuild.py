@@ -22,7 +22,7 @@ from gcs.control.loop_delay import longest_repetition_ns, repeated_s
 from gcs.control.loops import TickInputs, Vector
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray, in_sequence
 from gcs.link import mavlink
-from gcs.link.clocks import UNANSWERED
+from gcs.link.clocks import UNANSWERED, bound_at_ns
 from gcs.link.vehicle import SILENCE_S, ignored
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
@@ -255,7 +255,7 @@ class _Rebuilding:
         bound_s = nan
         sample_ns = clock.sampled_ns(boot_ms, time_ns, newest=vehicle.remote.newest)
         if sample_ns is not None:
-            bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
+            bound_s = bound_at_ns(clock.estimate, sample_ns) * 1e-9
         elif self._outline.exchanges:
             if not clock.exchange_due:
                 self._telemetry_ns[row] = time_ns

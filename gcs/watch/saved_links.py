@@ -17,6 +17,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.errors import InputError
 from gcs.link import mavlink
+from gcs.link.clocks import boot_ns_of, to_station_ns
 from gcs.watch.links import Watch
 from scenarios.keys.link import TRACE_DELAYS, Jitter, Link, LossBursts
 from scenarios.keys.profile import Latency, LinkProfile, Measured
@@ -72,10 +73,10 @@ class LinkRecorder:
         if exchanges <= _SETTLED or not clock.samples:
             return
         if frame.msg_id == mavlink.LOCAL_POSITION_NED:
-            sampled_ns = clock.estimate.to_station_ns(clock.boot_ns(frame.fields[0], received_ns))
+            sampled_ns = to_station_ns(clock.estimate, boot_ns_of(clock.estimate, frame.fields[0], received_ns))
             own.up_s.append(max(0.0, (received_ns - sampled_ns) * 1e-9 - _BOOT_ROUNDING_S))
         elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:
-            own.up_s.append(max(0.0, (received_ns - clock.estimate.to_station_ns(frame.fields[0])) * 1e-9))
+            own.up_s.append(max(0.0, (received_ns - to_station_ns(clock.estimate, frame.fields[0])) * 1e-9))
 
     @property
     def measured(self) -> list[int]:

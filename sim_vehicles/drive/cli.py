@@ -284,17 +284,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--allow-code", action="store_true", help="run the Python code that the scenario names")
     parser.add_argument(
         "--vehicle-port",
-        type=_port,
+        type=lambda text: _address(text if ":" in text else f"127.0.0.1:{text}"),
         action="append",
         default=[],
         metavar="[HOST:]PORT",
         help="with --links-only: vehicles send here (127.0.0.1); repeatable",
     )
     return parser
-
-
-def _port(text: str) -> tuple[str, int]:
-    return _address(text if ":" in text else f"127.0.0.1:{text}")
 
 
 def _shown(address: tuple[str, int]) -> str:

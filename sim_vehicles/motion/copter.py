@@ -4,14 +4,14 @@
 
 on each axis, north and east; g = 0 if the set-point has no velocity. The air decelerates it by drag |v| v. Between
 set-points v_set integrates a_set if the autopilot does so. The climb rate follows its command with a lag of its own.
-RK4 integrates in steps of at most 10 ms.
+RK4 integrates in steps of at most 10 ms. Vectors in the plane are complex numbers, north + j east.
 """
 
 import math
 from typing import NamedTuple
 
 from scenarios import schema
-from sim_vehicles.motion.lagged import Inner, followed, longest_step_s
+from sim_vehicles.motion.lagged import Inner, followed, length, longest_step_s
 
 LONGEST_STEP_S = 0.01
 CLIMB_LAG_S = 0.3
@@ -25,12 +25,9 @@ YAW_RATE_MAX_RAD_S = 1.5
 class Motion(NamedTuple):
     """Position, velocity and acceleration; the altitude is above the initial ground."""
 
-    north_m: float
-    east_m: float
-    velocity_north_m_s: float = 0.0
-    velocity_east_m_s: float = 0.0
-    acceleration_north_m_s2: float = 0.0
-    acceleration_east_m_s2: float = 0.0
+    place_m: complex
+    velocity_m_s: complex = 0j
+    acceleration_m_s2: complex = 0j
     altitude_m: float = 0.0
     climb_m_s: float = 0.0
     yaw_rad: float = 0.0
@@ -41,10 +38,8 @@ class Motion(NamedTuple):
 class Target(NamedTuple):
     """The target that the autopilot steers to. Its velocity integrates `growth` times its acceleration."""
 
-    acceleration_north_m_s2: float = 0.0
-    acceleration_east_m_s2: float = 0.0
-    velocity_north_m_s: float = 0.0
-    velocity_east_m_s: float = 0.0
+    acceleration_m_s2: complex = 0j
+    velocity_m_s: complex = 0j
     velocity_gain_1_s: float = 0.0
     growth: float = 0.0
     climb_m_s: float = 0.0
@@ -53,7 +48,7 @@ class Target(NamedTuple):
     yaw_rad: float | None = None
     yaw_rate_rad_s: float = 0.0
     """Turn to `yaw_rad`; without one, turn at this rate."""
-    place_ne_m: tuple[float, float] | None = None
+    place_m: complex | None = None
     """Fly to this place; the velocity follows from the remaining distance."""
 
 
@@ -63,16 +58,12 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
     steps = max(1, math.ceil(duration_s / longest_s))
     h = duration_s / steps
     for _ in range(steps):
-        if target.place_ne_m is not None:  # the velocity that leads to the place
-            north, east = target.place_ne_m[0] - motion.north_m, target.place_ne_m[1] - motion.east_m
-            gain = min(PLACE_GAIN_1_S, limits.speed_max_m_s / max(math.hypot(north, east), 1e-9))
-            target = target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
+        if target.place_m is not None:  # the velocity that leads to the place
+            way_m = target.place_m - motion.place_m
+            gain = min(PLACE_GAIN_1_S, limits.speed_max_m_s / max(length(way_m), 1e-9))
+            target = target._replace(velocity_m_s=gain * way_m)
         motion = _step(motion, target, limits, h)
-        grown = target.growth * h
-        target = target._replace(
-            velocity_north_m_s=target.velocity_north_m_s + grown * target.acceleration_north_m_s2,
-            velocity_east_m_s=target.velocity_east_m_s + grown * target.acceleration_east_m_s2,
-        )
+        target = target._replace(velocity_m_s=target.velocity_m_s + target.growth * h * target.acceleration_m_s2)
     return motion, target
 
 
@@ -80,90 +71,67 @@ def pushed(
     motion: Motion, target: Target, limits: schema.Autopilot, piece: tuple[float, float, float, float, float]
 ) -> tuple[Motion, Target]:
     """As `advance`, over an interval of constant push, a `Piece` of `air`."""
-    t, half_north, half_east, north, east = piece
-    motion, target = advance(_shifted(motion, 0.0, 0.0, half_north, half_east), target, limits, t)
-    return _shifted(motion, north, east, half_north, half_east), target
-
-
-def _shifted(motion: Motion, north_m: float, east_m: float, north_m_s: float, east_m_s: float) -> Motion:
-    """The motion with these changes of position and velocity."""
-    return motion._replace(
-        north_m=motion.north_m + north_m,
-        east_m=motion.east_m + east_m,
-        velocity_north_m_s=motion.velocity_north_m_s + north_m_s,
-        velocity_east_m_s=motion.velocity_east_m_s + east_m_s,
-    )
+    t, half_m_s, carried_m = piece[0], complex(*piece[1:3]), complex(*piece[3:])
+    motion, target = advance(motion._replace(velocity_m_s=motion.velocity_m_s + half_m_s), target, limits, t)
+    place_m, velocity_m_s = motion.place_m + carried_m, motion.velocity_m_s + half_m_s
+    return motion._replace(place_m=place_m, velocity_m_s=velocity_m_s), target
 
 
 def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) -> Motion:
     if motion.inner is not None:
         return _step_remembering(motion, motion.inner, target, limits, h)
-    north, east, v_n, v_e, a_n, a_e, *_ = motion
-    half = 0.5 * h
+    place, v, a, half = motion.place_m, motion.velocity_m_s, motion.acceleration_m_s2, 0.5 * h
     # v' = a and lag a' = w - a; the position is the integral of the velocity
-    j1n, j1e = _jerk(v_n, v_e, a_n, a_e, target, limits, 0.0)
-    a2n, a2e, v2n, v2e = a_n + half * j1n, a_e + half * j1e, v_n + half * a_n, v_e + half * a_e
-    j2n, j2e = _jerk(v2n, v2e, a2n, a2e, target, limits, half)
-    a3n, a3e, v3n, v3e = a_n + half * j2n, a_e + half * j2e, v_n + half * a2n, v_e + half * a2e
-    j3n, j3e = _jerk(v3n, v3e, a3n, a3e, target, limits, half)
-    a4n, a4e, v4n, v4e = a_n + h * j3n, a_e + h * j3e, v_n + h * a3n, v_e + h * a3e
-    j4n, j4e = _jerk(v4n, v4e, a4n, a4e, target, limits, h)
+    j1 = _jerk(v, a, target, limits, 0.0)
+    a2, v2 = a + half * j1, v + half * a
+    j2 = _jerk(v2, a2, target, limits, half)
+    a3, v3 = a + half * j2, v + half * a2
+    j3 = _jerk(v3, a3, target, limits, half)
+    a4, v4 = a + h * j3, v + h * a3
+    j4 = _jerk(v4, a4, target, limits, h)
     sixth = h / 6.0
-    north += sixth * (v_n + 2.0 * (v2n + v3n) + v4n)
-    east += sixth * (v_e + 2.0 * (v2e + v3e) + v4e)
-    v_n += sixth * (a_n + 2.0 * (a2n + a3n) + a4n)
-    v_e += sixth * (a_e + 2.0 * (a2e + a3e) + a4e)
-    a_n += sixth * (j1n + 2.0 * (j2n + j3n) + j4n)
-    a_e += sixth * (j1e + 2.0 * (j2e + j3e) + j4e)
-    return _after(motion, (north, east, v_n, v_e, a_n, a_e), target, limits, h)
+    place += sixth * (v + 2.0 * (v2 + v3) + v4)
+    v += sixth * (a + 2.0 * (a2 + a3) + a4)
+    a += sixth * (j1 + 2.0 * (j2 + j3) + j4)
+    return _after(motion, place, v, a, target, limits, h)
 
 
-def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """The motion after a step: `plane` with its speed reduced by drag and limited, and the new altitude and yaw."""
-    north, east, v_n, v_e, a_n, a_e = plane
-    speed = math.hypot(v_n, v_e)
+def _after(
+    motion: Motion, place: complex, v: complex, a: complex, target: Target, limits: schema.Autopilot, h: float
+) -> Motion:
+    """The motion after a step, its speed reduced by drag and limited, with the new altitude and yaw."""
+    speed = length(v)
     if limits.drag_1_m:  # speed' = -drag speed^2
         left = 1.0 / (1.0 + limits.drag_1_m * speed * h)
-        v_n, v_e, speed = left * v_n, left * v_e, left * speed
+        v, speed = left * v, left * speed
     if speed > limits.speed_max_m_s:
-        v_n, v_e = v_n * limits.speed_max_m_s / speed, v_e * limits.speed_max_m_s / speed
+        v = v * limits.speed_max_m_s / speed
     altitude, climb = _climbed(motion.altitude_m, motion.climb_m_s, target, limits, h)
-    yaw_rad = _turned(motion.yaw_rad, target, h)
-    return Motion(north, east, v_n, v_e, a_n, a_e, altitude, climb, yaw_rad, motion.inner)
+    return Motion(place, v, a, altitude, climb, _turned(motion.yaw_rad, target, h), motion.inner)
 
 
 def _step_remembering(motion: Motion, inner: Inner, target: Target, limits: schema.Autopilot, h: float) -> Motion:
     """A step of a response with internal state: the acceleration wanted in mid-step is held throughout the step."""
-    north, east, v_n, v_e, a_n, a_e, *_ = motion
-    half, gain = 0.5 * h, target.velocity_gain_1_s
-    w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2
-    if gain:
-        grown = target.growth * half
-        w_n, w_e = (
-            w_n + gain * (target.velocity_north_m_s + grown * w_n - v_n - half * a_n),
-            w_e + gain * (target.velocity_east_m_s + grown * w_e - v_e - half * a_e),
-        )
-    inner, (a_n, a_e), (mean_n, mean_e) = followed(inner, (w_n, w_e), (a_n, a_e), limits, h)
-    after_n, after_e = v_n + h * mean_n, v_e + h * mean_e
-    north, east = north + half * (v_n + after_n), east + half * (v_e + after_e)
-    moved = _after(motion, (north, east, after_n, after_e, a_n, a_e), target, limits, h)
-    return moved._replace(inner=inner)
+    v, a, half = motion.velocity_m_s, motion.acceleration_m_s2, 0.5 * h
+    inner, a, mean = followed(inner, _wanted(v, target, half, half * a), a, limits, h)
+    after = v + h * mean
+    return _after(motion, motion.place_m + half * (v + after), after, a, target, limits, h)._replace(inner=inner)
 
 
-def _jerk(
-    v_n: float, v_e: float, a_n: float, a_e: float, target: Target, limits: schema.Autopilot, since_s: float
-) -> tuple[float, float]:
-    gain, grown = target.velocity_gain_1_s, target.growth * since_s
-    w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2
-    if gain:
-        w_n, w_e = (
-            w_n + gain * (target.velocity_north_m_s + grown * w_n - v_n),
-            w_e + gain * (target.velocity_east_m_s + grown * w_e - v_e),
-        )
-    size = math.hypot(w_n, w_e)
+def _wanted(v: complex, target: Target, since_s: float, gained: complex = 0j) -> complex:
+    """The acceleration wanted, before any limit, `since_s` into a step in which the velocity has `gained` on v."""
+    w = target.acceleration_m_s2
+    if target.velocity_gain_1_s:
+        w += target.velocity_gain_1_s * (target.velocity_m_s + target.growth * since_s * w - v - gained)
+    return w
+
+
+def _jerk(v: complex, a: complex, target: Target, limits: schema.Autopilot, since_s: float) -> complex:
+    w = _wanted(v, target, since_s)
+    size = length(w)
     if size > limits.acceleration_max_m_s2:
-        w_n, w_e = w_n * limits.acceleration_max_m_s2 / size, w_e * limits.acceleration_max_m_s2 / size
-    return (w_n - a_n) / limits.lag_s, (w_e - a_e) / limits.lag_s
+        w = w * limits.acceleration_max_m_s2 / size
+    return (w - a) / limits.lag_s
 
 
 def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autopilot, h: float) -> tuple[float, float]:
@@ -183,3 +151,8 @@ def _turned(yaw_rad: float, target: Target, h: float) -> float:
         turn = math.remainder(target.yaw_rad - yaw_rad, math.tau)
     largest = YAW_RATE_MAX_RAD_S * h
     return math.remainder(yaw_rad + max(-largest, min(largest, turn)), math.tau)
+
+
+def pair(vector: complex) -> tuple[float, float]:
+    """North and east of a vector."""
+    return vector.real, vector.imag

@@ -4,8 +4,9 @@
     lag with dead time  lag a'(t) = w(t - T) - a(t)
     second order        a'' / omega_n^2 + lag a' = w - a
 
-on each axis, north and east. |w| is clipped to the acceleration limit, then the rate of w to the jerk limit. Within a
-step w is held at its mean. The plain lag without a jerk limit is in `sim_vehicles.motion.copter`.
+on each axis, in vectors that are complex numbers, north + j east. |w| is clipped to the acceleration limit, then the
+rate of w to the jerk limit. Within a step w is held at its mean. The plain lag without a jerk limit is in
+`sim_vehicles.motion.copter`.
 """
 
 import math
@@ -13,26 +14,25 @@ from typing import NamedTuple
 
 from scenarios import schema
 
-Vector = tuple[float, float]
-_Line = tuple[tuple[float, float, float], ...]
+_Line = tuple[tuple[float, complex], ...]
 
 
 class Inner(NamedTuple):
     """Internal state of a response besides velocity and acceleration."""
 
-    aimed_m_s2: Vector = (0.0, 0.0)
+    aimed_m_s2: complex = 0j
     """The acceleration aimed at, within the limits."""
-    jerk_m_s3: Vector = (0.0, 0.0)
+    jerk_m_s3: complex = 0j
     """a' of a second-order response."""
     line: _Line = ()
-    """Delay line: the accelerations aimed at in the last dead time, oldest first, as (duration in s, north, east)."""
+    """Delay line: the accelerations aimed at in the last dead time, oldest first, with their durations in s."""
 
 
 def inner_of(settings: schema.Autopilot) -> Inner | None:
     """The internal state of a response at rest; None for a plain lag without a jerk limit."""
     if not (settings.dead_time_s or settings.natural_frequency_rad_s or settings.jerk_max_m_s3):
         return None
-    return Inner(line=((settings.dead_time_s, 0.0, 0.0),) if settings.dead_time_s else ())
+    return Inner(line=((settings.dead_time_s, 0j),) if settings.dead_time_s else ())
 
 
 def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
@@ -42,39 +42,38 @@ def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
 
 
 def followed(
-    inner: Inner, wanted_m_s2: Vector, acceleration_m_s2: Vector, settings: schema.Autopilot, h: float
-) -> tuple[Inner, Vector, Vector]:
+    inner: Inner, wanted_m_s2: complex, acceleration_m_s2: complex, settings: schema.Autopilot, h: float
+) -> tuple[Inner, complex, complex]:
     """Internal state and acceleration after a step, and the mean acceleration during it."""
-    north, east = wanted_m_s2
-    over = math.hypot(north, east) / settings.acceleration_max_m_s2
+    aimed = wanted_m_s2
+    over = length(aimed) / settings.acceleration_max_m_s2
     if over > 1.0:
-        north, east = north / over, east / over
-    was_north, was_east = inner.aimed_m_s2
+        aimed /= over
     if settings.jerk_max_m_s3 is not None:
-        far = math.hypot(north - was_north, east - was_east) / (settings.jerk_max_m_s3 * h)
+        change = aimed - inner.aimed_m_s2
+        far = length(change) / (settings.jerk_max_m_s3 * h)
         if far > 1.0:
-            north, east = was_north + (north - was_north) / far, was_east + (east - was_east) / far
-    line, acting = inner.line, (north, east)
+            aimed = inner.aimed_m_s2 + change / far
+    line, acting = inner.line, aimed
     if line:
-        line, acting = _shifted((*line, (h, north, east)), h)
-    a, jerk, mean = acceleration_m_s2, inner.jerk_m_s3, (0.0, 0.0)
+        line, acting = _shifted((*line, (h, aimed)), h)
+    a, jerk = acceleration_m_s2, inner.jerk_m_s3
     if settings.natural_frequency_rad_s is None:
         left = math.exp(-h / settings.lag_s)
         gone = settings.lag_s * (1.0 - left) / h
-        after = acting[0] + (a[0] - acting[0]) * left, acting[1] + (a[1] - acting[1]) * left
-        mean = acting[0] + (a[0] - acting[0]) * gone, acting[1] + (a[1] - acting[1]) * gone
+        after, mean = acting + (a - acting) * left, acting + (a - acting) * gone
     else:
-        axes = [_second_order(x, j, to, settings, h) for x, j, to in zip(a, jerk, acting, strict=True)]
-        (north_a, north_j, north_mean), (east_a, east_j, east_mean) = axes
-        after, jerk, mean = (north_a, east_a), (north_j, east_j), (north_mean, east_mean)
-    return Inner((north, east), jerk, line), after, mean
+        after, jerk, mean = _second_order(a, jerk, acting, settings, h)
+    return Inner(aimed, jerk, line), after, mean
 
 
-def _second_order(a: float, jerk: float, to: float, settings: schema.Autopilot, h: float) -> tuple[float, float, float]:
+def _second_order(
+    a: complex, jerk: complex, to: complex, settings: schema.Autopilot, h: float
+) -> tuple[complex, complex, complex]:
     """a, a' and the mean of a after a step, for a constant input: RK4, whose error at 0.3 rad a step is 2e-5."""
     square = (settings.natural_frequency_rad_s or 0.0) ** 2
 
-    def curve(a: float, jerk: float) -> float:
+    def curve(a: complex, jerk: complex) -> complex:
         return square * (to - a - settings.lag_s * jerk)
 
     half = 0.5 * h
@@ -89,18 +88,18 @@ def _second_order(a: float, jerk: float, to: float, settings: schema.Autopilot, 
     return after, jerk + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), (a + 2.0 * (a2 + a3) + a4) / 6.0
 
 
-def _shifted(line: _Line, h: float) -> tuple[_Line, Vector]:
+def _shifted(line: _Line, h: float) -> tuple[_Line, complex]:
     """The delay line without its oldest `h` seconds, and the mean acceleration over those."""
-    north = east = 0.0
-    left_s, first = h, 0
-    while first < len(line):
-        duration_s, one_north, one_east = line[first]
+    gained, left_s = 0j, h
+    for first, (duration_s, one) in enumerate(line):
         taken_s = min(duration_s, left_s)
-        north += taken_s * one_north
-        east += taken_s * one_east
+        gained += taken_s * one
         left_s -= taken_s
         if duration_s > taken_s + 1e-12:
-            rest = ((duration_s - taken_s, one_north, one_east), *line[first + 1 :])
-            return rest, (north / h, east / h)
-        first += 1
-    return (), (north / h, east / h)
+            return ((duration_s - taken_s, one), *line[first + 1 :]), gained / h
+    return (), gained / h
+
+
+def length(vector: complex) -> float:
+    """The length of a vector; that of `abs` depends on the C library."""
+    return math.hypot(vector.real, vector.imag)

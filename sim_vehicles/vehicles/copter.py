@@ -15,9 +15,9 @@ from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import ACTED
 from sim_vehicles.motion.air import Air
-from sim_vehicles.motion.copter import Motion, Target, advance, pushed
+from sim_vehicles.motion.copter import Motion, Target, advance, pair, pushed
 from sim_vehicles.motion.double_integrator import State, state_from
-from sim_vehicles.motion.lagged import inner_of
+from sim_vehicles.motion.lagged import inner_of, length
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.services import frames, mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
@@ -59,8 +59,8 @@ class Copter:
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
-        self.home_ne_m = own.position_ne_m
-        self.motion = Motion(*own.position_ne_m, inner=inner_of(self.settings))
+        self.home_m = complex(*own.position_ne_m)
+        self.motion = Motion(self.home_m, inner=inner_of(self.settings))
         drawn = draws_of(scenario.seed, own.system_id, Use.ORIGIN).random(3)
         spread = (2.0 * drawn - 1.0) * self.settings.origin_spread_m
         north_m, east_m, up_m = spread.tolist()
@@ -89,7 +89,7 @@ class Copter:
         motion = self.motion
         if not self.landed and time_ns > self._motion_ns:
             motion, _ = self._flown(time_ns, foreseen=True)
-        return state_from(motion[0:2], motion[2:4])
+        return state_from(pair(motion.place_m), pair(motion.velocity_m_s))
 
     # Timed events
 
@@ -262,7 +262,7 @@ class Copter:
             return encoder.heartbeat(self.mode, armed=self.armed, flying=flying, critical=self.failsafe, autopilot=kind)
         if message_id == frames.LOCAL_POSITION and ready:
             down_m = origin_up_m - motion.altitude_m
-            place, velocity = (motion.north_m - origin_north_m, motion.east_m - origin_east_m), motion[2:4]
+            place, velocity = pair(motion.place_m - complex(*self.origin_neu_m[:2])), pair(motion.velocity_m_s)
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             return encoder.local_position(boot_ms, (*place, down_m), (*velocity, -motion.climb_m_s))
@@ -277,9 +277,8 @@ class Copter:
         elif message_id == mavlink.POSITION_TARGET and self._steers:
             message = self._active_target(boot_ms)
         elif message_id == mavlink.HOME_POSITION and ready:
-            north, east = self.home_ne_m
-            local = north - origin_north_m, east - origin_east_m, origin_up_m
-            message = messages.home_position(degrees(north, east), local)
+            local = *pair(self.home_m - complex(*self.origin_neu_m[:2])), origin_up_m
+            message = messages.home_position(degrees(*pair(self.home_m)), local)
         else:
             return None
         return encoder.pack(message)
@@ -295,26 +294,27 @@ class Copter:
         In ArduCopter the velocity has since integrated the acceleration, which itself was rounded when converted to cm
         and back in float32. PX4 reports the acceleration that its velocity loop wants.
         """
-        target, (north, east) = self._target, self._target[0:2]
+        target, acceleration = self._target, self._target.acceleration_m_s2
         if self.rules.velocity_grows:
-            north, east = (np.array((north, east), np.float32) * np.float32(100.0) * np.float32(0.01)).tolist()
+            in_cm = np.array(pair(acceleration), np.float32) * np.float32(100.0)
+            acceleration = complex(*(in_cm * np.float32(0.01)).tolist())
         else:
-            north += target.velocity_gain_1_s * (target.velocity_north_m_s - self.motion.velocity_north_m_s)
-            east += target.velocity_gain_1_s * (target.velocity_east_m_s - self.motion.velocity_east_m_s)
+            acceleration += target.velocity_gain_1_s * (target.velocity_m_s - self.motion.velocity_m_s)
         mask = POSITION_AXES | YAW_IGNORED | YAW_RATE_IGNORED | (0 if target.velocity_gain_1_s else VELOCITY_AXES)
-        return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), (north, east))
+        velocity = *pair(target.velocity_m_s), -target.climb_m_s
+        return messages.position_target(boot_ms, mask, velocity, pair(acceleration))
 
     def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
         """Its state as reported to other ground stations; the tilt follows from the acceleration."""
         motion = self.motion
         cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
-        north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
+        north, east = pair(motion.acceleration_m_s2 / GRAVITY_M_S2)
         roll_rad, pitch_rad = math.atan(cosine * east - sine * north), -math.atan(cosine * north + sine * east)
         return messages.Condition(
             boot_ms,
-            degrees(motion.north_m, motion.east_m),
+            degrees(*pair(motion.place_m)),
             ORIGIN_ALTITUDE_M + motion.altitude_m,
-            (*motion[2:4], -motion.climb_m_s),
+            (*pair(motion.velocity_m_s), -motion.climb_m_s),
             (roll_rad, pitch_rad, motion.yaw_rad),
             flying=not self.landed,
             has_position=has_position,
@@ -324,9 +324,9 @@ class Copter:
 
     def _stopped(self) -> Target:
         """The target of a mode without set-points: stop, sink, or fly home."""
-        gain, place = self.settings.velocity_gain_1_s, self.home_ne_m if self.mode == self.rules.return_mode else None
+        gain, place = self.settings.velocity_gain_1_s, self.home_m if self.mode == self.rules.return_mode else None
         climb_m_s = -SINK_FAST_M_S if self.mode == self.rules.land_mode else 0.0
-        return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_ne_m=place)
+        return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_m=place)
 
     def _leave_ground(self, time_ns: int) -> None:
         self.landed = False
@@ -363,10 +363,10 @@ class Copter:
             self._target = self._target._replace(climb_m_s=-sink)
             if altitude_m <= 0.0:
                 self.landed, self.armed = True, False
-                where, yaw_rad = self.motion[:2], self.motion.yaw_rad
-                self.motion = Motion(*where, yaw_rad=yaw_rad, inner=inner_of(self.settings))
+                where_m, yaw_rad = self.motion.place_m, self.motion.yaw_rad
+                self.motion = Motion(where_m, yaw_rad=yaw_rad, inner=inner_of(self.settings))
                 self._radio.tell(time_ns, "landed")
-        elif self.mode == self.rules.return_mode and math.dist(self.motion[:2], self.home_ne_m) < HOME_M:
+        elif self.mode == self.rules.return_mode and length(self.motion.place_m - self.home_m) < HOME_M:
             self.mode = self.rules.land_mode
             self._target = self._stopped()
             self._radio.tell(time_ns, self.rules.modes[self.mode])

@@ -155,8 +155,8 @@ def setpoint_target(
     if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= setpoints.ABSURD:
         return "refused_absurd", Target()
     return "", Target(
-        *acceleration[:2],
-        *velocity[:2],
+        complex(*acceleration[:2]),
+        complex(*velocity[:2]),
         velocity_gain_1_s=velocity_gain_1_s if velocity_counts else 0.0,
         growth=1.0 if velocity_counts and rules.velocity_grows else 0.0,
         climb_m_s=-velocity[2],

@@ -22,6 +22,7 @@ from gcs.studies.benchmark import start_and_speed
 from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import ClockJump, NominalVelocity
 from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.motion.copter import pair
 from sim_vehicles.vehicles.copter_rules import RULES
 from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
 from tests.support.fleets.pilots import PilotsVehicle
@@ -64,7 +65,7 @@ def test_the_announced_time_of_a_sweep_has_the_take_off() -> None:
 def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
     flight = usual("ardupilot")
     # the last positions in the scenario's frame, braking by then in the same way
-    place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
+    place = {k: np.array(pair(flight.copter(k).motion.place_m)) for k in (1, 2, 3)}
     assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are said to 11 mm
     down_m = flight.flown["down_m"][-3:]
     assert np.ptp(down_m) == pytest.approx(0.0, abs=0.1)  # all at 20 m above one ground

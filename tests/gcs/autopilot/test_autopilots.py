@@ -5,7 +5,7 @@ import math
 import pytest
 
 from gcs.autopilot.fleet import AutopilotFleet
-from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Seen, kind_of, next_step
+from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, kind_of
 from gcs.autopilot.startup import AutopilotStartup, between, shifted
 from gcs.control.history import StateHistory
 from gcs.link.kinds import UNRECOGNISED, Kind, commanded_mode, mode_command
@@ -14,53 +14,62 @@ from tests.support.fleets.flown_copters import plan_for, three
 
 ALTITUDE_M = 20.0
 GOOD = 0x33F
-BEFORE = Seen(
-    interval_due=None,
-    clock_known=True,
-    position_heard=True,
-    estimator_flags=GOOD,
-    origin_known=True,
-    custom_mode=0,
-    armed=False,
-    stays_disarmed="",
-    took_off=False,
-    airborne=False,
-    relative_altitude_m=0.0,
-    sea_level_m=584.0,
-)
 OFFBOARD = 6 << 16
+AUTOPILOTS = {ARDUCOPTER: 3, PX4_COPTER: 12}
 
 
-def advised(kind: Kind, seen: Seen) -> tuple[str, tuple[int, tuple[float, ...]] | None]:
-    step = next_step(kind, seen, altitude_m=ALTITUDE_M)
-    return step.missing, step.command
+class Told:
+    """The start-up of a vehicle that has sent its messages, without those with the ids in `but`, and accepted rates."""
+
+    def __init__(self, kind: Kind, *, flags: int = GOOD, but: int = -1) -> None:
+        self.startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+        self.startup.recognise(AUTOPILOTS[kind], 2)
+        status = 193 if kind is ARDUCOPTER else 230
+        for number, fields in (
+            (32, (1000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
+            (49, (-353632620, 1491652370, 584_000)),
+            (status, (flags,) * 10),
+        ):
+            if number != but:
+                self.startup.take(number, fields)
+        if but != 33:
+            self.at(0.0)
+        for number in (32.0, 33.0, 49.0, float(status)):
+            self.startup.accepted(511, (number, 0.0), 0)
+
+    def at(self, height_m: float) -> None:
+        self.startup.take(33, (1000, -353632620, 1491652370, 584_000 + round(1e3 * height_m), round(1e3 * height_m)))
+
+    def advised(
+        self, mode: int = 0, *, armed: bool = False, clock_known: bool = True
+    ) -> tuple[str, tuple[int, tuple[float, ...]] | None]:
+        return self.startup.next(custom_mode=mode, armed=armed, clock_known=clock_known, now_ns=0)
 
 
 def test_arducopter_goes_guided_arms_takes_off_and_then_is_ready() -> None:
-    seen = BEFORE
-    assert advised(ARDUCOPTER, seen) == ("does not enter GUIDED", (176, (1.0, 4.0)))
-    seen = seen._replace(custom_mode=4)
-    assert advised(ARDUCOPTER, seen) == ("does not arm", (400, (1.0,)))
-    seen = seen._replace(armed=True)
-    assert advised(ARDUCOPTER, seen) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
-    seen = seen._replace(took_off=True, relative_altitude_m=7.31)
-    assert advised(ARDUCOPTER, seen) == ("climbs to 20 m, is at 7.3 m", None)
-    assert advised(ARDUCOPTER, seen._replace(airborne=True)) == ("", None)
+    copter = Told(ARDUCOPTER)
+    assert copter.advised() == ("does not enter GUIDED", (176, (1.0, 4.0)))
+    assert copter.advised(4) == ("does not arm", (400, (1.0,)))
+    assert copter.advised(4, armed=True) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
+    copter.startup.accepted(22, (), 0)
+    copter.at(7.31)
+    assert copter.advised(4, armed=True) == ("climbs to 20 m, is at 7.3 m", None)
+    copter.at(19.5)
+    assert copter.advised(4, armed=True) == ("", None)
 
 
 def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
-    seen = BEFORE._replace(custom_mode=4 << 16 | 3 << 24)
-    assert advised(PX4_COPTER, seen) == ("does not arm", (400, (1.0,)))
-    seen = seen._replace(armed=True)
-    _, command = advised(PX4_COPTER, seen)
+    copter, hold = Told(PX4_COPTER), 4 << 16 | 3 << 24
+    assert copter.advised(hold) == ("does not arm", (400, (1.0,)))
+    _, command = copter.advised(hold, armed=True)
     assert command is not None
     assert (command[0], command[1][6]) == (22, 604.0)
     assert all(math.isnan(value) for value in command[1][3:6])  # numbers would be a place to fly to
-    seen = seen._replace(took_off=True, custom_mode=4 << 16 | 2 << 24)
-    assert advised(PX4_COPTER, seen)[1] is None
-    seen = seen._replace(airborne=True, custom_mode=4 << 16 | 3 << 24)
-    assert advised(PX4_COPTER, seen) == ("does not enter OFFBOARD", (176, (1.0, 6.0, 0.0)))
-    assert advised(PX4_COPTER, seen._replace(custom_mode=OFFBOARD)) == ("", None)
+    copter.startup.accepted(22, (), 0)
+    assert copter.advised(4 << 16 | 2 << 24, armed=True)[1] is None
+    copter.at(19.5)
+    assert copter.advised(hold, armed=True) == ("does not enter OFFBOARD", (176, (1.0, 6.0, 0.0)))
+    assert copter.advised(OFFBOARD, armed=True) == ("", None)
 
 
 @pytest.mark.parametrize(
@@ -68,24 +77,30 @@ def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
 )
 def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready: bool) -> None:
     for kind in (ARDUCOPTER, PX4_COPTER):
-        missing, command = advised(kind, BEFORE._replace(estimator_flags=flags))
+        missing, command = Told(kind, flags=flags).advised()
         assert (command is not None) == ready
         assert ready or missing == f"has no position yet (estimator flags 0x{flags:x})"
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("unsaid", "words"),
     [
-        ({"interval_due": (32.0, 20000.0)}, "does not accept the rate of message 32"),
-        ({"clock_known": False}, "does not answer TIMESYNC"),
-        ({"estimator_flags": None}, "sends no estimator status (message 193)"),
-        ({"position_heard": False}, "sends no LOCAL_POSITION_NED"),
-        ({"relative_altitude_m": None}, "sends no GLOBAL_POSITION_INT"),
-        ({"origin_known": False}, "does not say where its local origin is"),
+        (193, "sends no estimator status (message 193)"),
+        (32, "sends no LOCAL_POSITION_NED"),
+        (33, "sends no GLOBAL_POSITION_INT"),
     ],
 )
-def test_what_is_missing_is_named(change: dict[str, object], words: str) -> None:
-    assert advised(ARDUCOPTER, BEFORE._replace(**change))[0] == words  # pyright: ignore[reportArgumentType]
+def test_a_message_that_is_missing_is_named(unsaid: int, words: str) -> None:
+    assert Told(ARDUCOPTER, but=unsaid).advised() == (words, None)
+
+
+def test_an_unaccepted_rate_an_unknown_clock_and_an_unknown_origin_are_named() -> None:
+    copter = Told(ARDUCOPTER)
+    assert copter.advised(clock_known=False) == ("does not answer TIMESYNC", None)
+    copter.startup.origin = None
+    assert copter.advised() == ("does not say where its local origin is", None)
+    copter.startup.begin_anew()
+    assert copter.advised() == ("does not accept the rate of message 32", (511, (32.0, 20000.0)))
 
 
 def test_a_vehicle_found_flying_is_not_told_to_take_off() -> None:

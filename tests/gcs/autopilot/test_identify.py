@@ -43,16 +43,16 @@ def flown(
         natural_frequency_rad_s=response.natural_frequency_rad_s,
         **limits,  # pyright: ignore[reportArgumentType]
     )
-    motion, velocity, sample_s = Motion(0.0, 0.0, inner=inner_of(autopilot)), 0.0, np.arange(FIRST_S, 6.0, 1 / rate_hz)
+    motion, velocity, sample_s = Motion(0j, inner=inner_of(autopilot)), 0j, np.arange(FIRST_S, 6.0, 1 / rate_hz)
     commands, velocities = list[float](), list[float]()
     for k in range(COMMANDS):
         at_s = k * PERIOD_S
         commands.append(math.copysign(2.0, math.sin(2 * at_s)) if square else manoeuvre_m_s2(at_s, amplitude_m_s2(3.0)))
-        target = Target(commands[-1], 0.0, velocity, 0.0, autopilot.velocity_gain_1_s, growth=1.0)
+        target = Target(complex(commands[-1]), velocity, autopilot.velocity_gain_1_s, growth=1.0)
         for sample in sample_s[(sample_s >= at_s) & (sample_s < at_s + PERIOD_S)].tolist():
-            velocities.append(advance(motion, target, autopilot, sample - at_s)[0].velocity_north_m_s)
+            velocities.append(advance(motion, target, autopilot, sample - at_s)[0].velocity_m_s.real)
         motion, target = advance(motion, target, autopilot, PERIOD_S)
-        velocity = target.velocity_north_m_s
+        velocity = target.velocity_m_s
     noise = np.random.default_rng(3).normal(0.0, noise_m_s, sample_s.size)
     return Flown(PERIOD_S, np.array(commands), sample_s, np.array(velocities) + 0.2 + noise)
 

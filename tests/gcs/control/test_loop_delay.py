@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gcs.control.loop_delay import headroom, longest_repetition_ns, loop_delay_s, repeated_s
-from gcs.link.clocks import LEAST_SAMPLES, VehicleClock
+from gcs.link.clocks import LEAST_SAMPLES, VehicleClock, bound_at_ns
 from scenarios.schema import Rates
 
 S, MS = 1_000_000_000, 1_000_000
@@ -51,7 +51,7 @@ def test_the_error_of_the_clock_cancels_however_asymmetric_the_link(up_ms: int, 
     used_ns = clock.sampled_ns((sampled_ns - booted_ns) // MS, sampled_ns + up_ms * MS, newest=True)
     assert used_ns is not None
     assert clock.down_ns is not None
-    bound_s = (clock.estimate.bound_at_ns(used_ns) + clock.down_bound_ns) * 1e-9
+    bound_s = (bound_at_ns(clock.estimate, used_ns) + clock.down_bound_ns) * 1e-9
     measured_s, true_s = loop_delay_s(used_ns, sent_ns, clock.down_ns * 1e-9), (up_ms + 7 + down_ms) * 1e-3
     assert abs(used_ns - sampled_ns) == pytest.approx(abs(up_ms - down_ms) / 2 * MS, abs=MS / 10)
     assert abs(measured_s - true_s) < min(1e-5, bound_s)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gcs.link.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
+from gcs.link.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock, bound_at_ns, to_station_ns
 from gcs.link.datagram import Block, Outbox
 from gcs.link.vehicle import ask, new_links, note_requests
 from scenarios.schema import DRIFT_MAX_PPM, Clocks
@@ -32,10 +32,10 @@ class Exchange:
         return self.clock.reply(tc1_ns=tc1, ts1_ns=ts1, received_ns=time_ns + down_ns + up_ns)
 
     def error_ns(self, time_ns: int) -> int:
-        return self.clock.estimate.to_station_ns(self.boot_ns(time_ns)) - time_ns
+        return to_station_ns(self.clock.estimate, self.boot_ns(time_ns)) - time_ns
 
     def bounded(self, time_ns: int) -> bool:
-        return abs(self.error_ns(time_ns)) <= self.clock.estimate.bound_at_ns(time_ns)
+        return abs(self.error_ns(time_ns)) <= bound_at_ns(self.clock.estimate, time_ns)
 
 
 def test_round_trips_count_from_when_requests_were_sent() -> None:

@@ -81,8 +81,8 @@ def test_the_truth_log_holds_the_gusts_that_moved_the_vehicle() -> None:
 def test_wind_moves_a_copter_as_its_equations_say() -> None:
     limits = Autopilot(acceleration_max_m_s2=50.0)
     around = air.Air(disturbed(wind_ne_m_s2=(0.4, 0.0)), 1, START, None)
-    target = copter.Target(velocity_north_m_s=3.0, velocity_gain_1_s=2.0)
-    motion = copter.Motion(0.0, 0.0)
+    target = copter.Target(velocity_m_s=3.0 + 0j, velocity_gain_1_s=2.0)
+    motion = copter.Motion(0j)
     for k in range(200):
         at_ns = START + k * air.STEP_NS
         for piece in around.pieces(at_ns, at_ns + air.STEP_NS):
@@ -93,7 +93,7 @@ def test_wind_moves_a_copter_as_its_equations_say() -> None:
 
     exact = solve_ivp(rates, (0.0, 2.0), [0.0, 0.0, 0.0], rtol=1e-10, atol=1e-12).y[:, -1]
     # the splitting of a step is of the second order in 10 ms
-    assert (motion.north_m, motion.velocity_north_m_s) == pytest.approx(exact[:2], abs=2e-4)
+    assert (motion.place_m.real, motion.velocity_m_s.real) == pytest.approx(exact[:2], abs=2e-4)
 
 
 def test_reports_are_wrong_by_the_noise_and_bias_asked_for() -> None:

@@ -20,16 +20,16 @@ STEP_S = 0.02
 
 def flown(settings: Autopilot, amplitude_m_s2: float, omega: float) -> complex:
     """Gain and phase of the acceleration, from a sine sent every 20 ms with its velocity."""
-    motion, sums, count = Motion(0.0, 0.0, inner=inner_of(settings)), 0j, round(20 * math.tau / omega / STEP_S)
-    velocity = 0.0
+    motion, sums, count = Motion(0j, inner=inner_of(settings)), 0j, round(20 * math.tau / omega / STEP_S)
+    velocity = 0j
     for k in range(2 * count):
         sent = amplitude_m_s2 * math.sin(omega * (k + 0.5) * STEP_S)
-        target = Target(sent, 0.0, velocity, 0.0, settings.velocity_gain_1_s, growth=1.0)
-        before = motion.velocity_north_m_s
+        target = Target(complex(sent), velocity, settings.velocity_gain_1_s, growth=1.0)
+        before = motion.velocity_m_s
         motion, target = advance(motion, target, settings, STEP_S)
-        velocity = target.velocity_north_m_s
+        velocity = target.velocity_m_s
         if k >= count:
-            mean = (motion.velocity_north_m_s - before) / STEP_S
+            mean = (motion.velocity_m_s - before).real / STEP_S
             sums += mean * np.exp(-1j * omega * (k + 0.5) * STEP_S)
     return 2j * sums / count / amplitude_m_s2
 
@@ -53,6 +53,6 @@ def test_beyond_its_jerk_limit_the_response_lags_far_behind() -> None:
 
 def test_a_remembering_response_keeps_to_its_acceleration_limit() -> None:
     settings = MODELS[2].model_copy(update={"acceleration_max_m_s2": 2.5})
-    motion, target = Motion(0.0, 0.0, inner=inner_of(settings)), Target(9.0, 0.0)
+    motion, target = Motion(0j, inner=inner_of(settings)), Target(9.0 + 0j)
     motion, _ = advance(motion, target, settings, 3.0)
-    assert motion.acceleration_north_m_s2 == pytest.approx(2.5, abs=1e-3)
+    assert motion.acceleration_m_s2.real == pytest.approx(2.5, abs=1e-3)

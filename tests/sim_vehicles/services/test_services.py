@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from sim_vehicles.motion.copter import pair
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.support.fleets.vehicle_kinds import VEHICLES, copter
@@ -324,7 +325,7 @@ def test_only_ignored_fields_may_be_nan(kind: str) -> None:
     for k in range(60):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(1, 0xDC7, (2.0, 0.0, 0.0), nan, nan, other=nan), at)], at)
-    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(2.0, abs=0.01)
+    assert vehicle.craft.motion.velocity_m_s.real == pytest.approx(2.0, abs=0.01)
     assert vehicle.counters["refused_absurd"] == 0
     bad = [((nan, 0.0, 0.0), 0.0, 0.0), ((2.0, 0.0, 0.0), nan, 0.0), ((2.0, 0.0, 0.0), 0.0, nan)]
     for velocity, yaw, rate in bad:
@@ -360,7 +361,7 @@ def test_a_copter_turns_to_the_commanded_yaw(kind: str) -> None:
         vehicle.step([(velocity_setpoint(8, 0xDC7, (2.0, 1.0, 0.0)), at)], at)
     forward, right = math.radians(-120.0), math.radians(-30.0)
     wanted = (2.0 * math.cos(forward) + math.cos(right), 2.0 * math.sin(forward) + math.sin(right))
-    assert vehicle.craft.motion[2:4] == pytest.approx(wanted, abs=1e-2)
+    assert pair(vehicle.craft.motion.velocity_m_s) == pytest.approx(wanted, abs=1e-2)
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
@@ -369,11 +370,11 @@ def test_a_copter_returns_home_and_lands(kind: str) -> None:
     for k in range(50):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(1, 0xDC7, (5.0, -5.0, 0.0)), at)], at)
-    assert math.dist(vehicle.craft.motion[:2], vehicle.craft.home_ne_m) > 10.0
+    assert abs(vehicle.craft.motion.place_m - vehicle.craft.home_m) > 10.0
     assert acknowledged(sent_after(vehicle, command(20), 27.5, 27.5), 20) == ACCEPTED
     vehicle.step([], START + 90 * SECOND)
     assert (vehicle.craft.landed, vehicle.craft.armed) == (True, False)
-    assert math.dist(vehicle.craft.motion[:2], vehicle.craft.home_ne_m) < 1.0
+    assert abs(vehicle.craft.motion.place_m - vehicle.craft.home_m) < 1.0
 
 
 @pytest.mark.parametrize("kind", VEHICLES)

@@ -150,9 +150,9 @@ def test_ardupilot_stops_three_seconds_after_its_last_set_point() -> None:
     vehicle, at_s = airborne()
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION, velocity=(3.0, 0.0)), at_s)
     vehicle.step([], START + round((at_s + 3.0) * SECOND))
-    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(3.0, abs=0.05)
+    assert vehicle.craft.motion.velocity_m_s.real == pytest.approx(3.0, abs=0.05)
     vehicle.step([], START + round((at_s + 9.0) * SECOND))
-    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(0.0, abs=0.01)
+    assert vehicle.craft.motion.velocity_m_s.real == pytest.approx(0.0, abs=0.01)
     assert vehicle.craft.mode == 4
 
 
@@ -192,8 +192,8 @@ def test_masks_mean_what_arducopter_makes_of_them(mask: int, reason: str) -> Non
     assert vehicle.counters[reason] == before + 1
     vehicle.step([], START + round((at_s + 2.0) * SECOND))
     moves = reason == "setpoints"
-    assert (abs(vehicle.craft.motion.velocity_north_m_s) > 0.5) == (moves and not mask & 8)
-    assert (vehicle.craft.motion.velocity_east_m_s > 0.5) == (moves and not mask & 64)
+    assert (abs(vehicle.craft.motion.velocity_m_s.real) > 0.5) == (moves and not mask & 8)
+    assert (vehicle.craft.motion.velocity_m_s.imag > 0.5) == (moves and not mask & 64)
 
 
 def integrated(
@@ -213,12 +213,12 @@ def integrated(
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_a_copter_responds_with_the_scenarios_lag(flavour: Flavour) -> None:
     vehicle, at_s = airborne(flavour, lag_s=0.3, velocity_gain_1_s=1.5)
-    start_m = vehicle.craft.motion.north_m
+    start_m = vehicle.craft.motion.place_m.real
     tell(vehicle, setpoint(0.7, 0.0, velocity=(1.2, 0.0), mask=VELOCITY_ACCELERATION), at_s)
     tell(vehicle, command(0), at_s + 0.9)  # whatever it is told, it is brought up to date
     expected = integrated(flavour, vehicle.craft.settings, (1.2, 0.7), 0.9)
     motion = vehicle.craft.motion
-    found = motion.north_m - start_m, motion.velocity_north_m_s, motion.acceleration_north_m_s2
+    found = motion.place_m.real - start_m, motion.velocity_m_s.real, motion.acceleration_m_s2.real
     assert found == pytest.approx(expected.tolist(), abs=1e-6)  # RK4 with steps of 10 ms against a lag of 300 ms
 
 
@@ -228,8 +228,8 @@ def test_acceleration_and_speed_limits_hold_in_every_direction() -> None:
     speeds: list[float] = []
     for k in range(200):
         tell(vehicle, setpoint(30.0, -40.0, mask=ACCELERATION), at_s + 0.05 * k)
-        accelerations.append(math.hypot(*vehicle.craft.motion[4:6]))
-        speeds.append(math.hypot(*vehicle.craft.motion[2:4]))
+        accelerations.append(abs(vehicle.craft.motion.acceleration_m_s2))
+        speeds.append(abs(vehicle.craft.motion.velocity_m_s))
     assert max(accelerations) == pytest.approx(2.0, abs=1e-6)
     assert max(speeds) == pytest.approx(6.0, abs=1e-6)
 
