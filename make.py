@@ -5,6 +5,7 @@ Each makes .venv first, from requirements.lock, and does nothing there if it is 
 """
 
 import argparse
+import fcntl
 import hashlib
 import os
 import re
@@ -19,7 +20,7 @@ LOCK = ROOT / "requirements.lock"
 
 # name: (what it is for, the commands; further arguments go to the last one)
 JOBS: dict[str, tuple[str, list[str]]] = {
-    "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
+    "setup": ("make .venv with everything in requirements.lock, compile what flies", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
     "test": ("run the tests", ["python -m pytest -n auto"]),
     "soak": (
@@ -82,10 +83,14 @@ def install() -> None:
         print("uv could not install them, pip tries", flush=True)
         subprocess.run([*pip, *locked], check=True)
     subprocess.run([*pip, "--no-deps", "--no-build-isolation", "--editable", str(ROOT)], check=True)
-    print("compiling what runs for every frame (half a minute; kept in ~/.cache/formation-gcs)", flush=True)
+    STAMP.write_text(wanted)
+
+
+def compile_kernels() -> None:
+    """Compile what runs for every frame, which the first flight would do otherwise."""
+    print("compiling what runs for every frame (a minute; kept in ~/.cache/formation-gcs)", flush=True)
     flight = [str(VENV / "bin" / "gcs"), "bench", "chain3", "--seconds", "1", "--repeat", "1"]
     subprocess.run(flight, check=True, stdout=subprocess.DEVNULL, cwd=VENV)
-    STAMP.write_text(wanted)
 
 
 def _installed_by_uv(python: Path, pip: list[str], locked: list[str]) -> bool:
@@ -107,7 +112,11 @@ def main() -> None:
         jobs.add_parser(name, help=text)
     chosen, further = parser.parse_known_args()
     try:
-        install()
+        with Path(__file__).open() as own:
+            fcntl.flock(own, fcntl.LOCK_EX)  # of several jobs at once, the first installs
+            install()
+        if chosen.job == "setup":
+            compile_kernels()
     except subprocess.CalledProcessError as error:
         sys.exit(f"installation failed: {' '.join(error.cmd)}")
     os.chdir(ROOT)
