@@ -29,7 +29,7 @@ from scenarios.files import dump, load
 from scenarios.schema import FixedGains
 from sim_vehicles.links.truth import read_truth
 from tests.support.paths import SCENARIOS
-from tests.support.processes import PATIENCE_S, free_port, until
+from tests.support.processes import PATIENCE_S, free_port, gcs, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
@@ -122,8 +122,7 @@ def is_recovered(folder: Path) -> bool:
         return True  # it had not begun
     before = (folder / "summary.json").exists()
     if not before:
-        command = [sys.executable, "-m", "gcs", "recover", str(folder)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        done = gcs("recover", folder)
         assert done.returncode == 0, done.stderr
     summary = json.loads((folder / "summary.json").read_text())
     ticks = read_ticks(folder)
@@ -138,10 +137,7 @@ def is_recovered(folder: Path) -> bool:
 
 
 def fly(scenario: Path, port: int, folder: Path, *options: str) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "gcs", "fly", str(scenario), "--listen", f"127.0.0.1:{port}", *options]
-    return subprocess.run(
-        [*command, "--out", str(folder), "--json"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
+    return gcs("fly", scenario, "--listen", f"127.0.0.1:{port}", *options, "--out", folder, "--json")
 
 
 @pytest.mark.slow(first=3)

@@ -2,10 +2,9 @@
 
 import json
 import socket
-import subprocess
 import threading  # noqa: TID251 - stands for another process
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from tests.support.fleets.flown_fleet import until
 from tests.support.paths import ROOT
-from tests.support.processes import GCS, PATIENCE_S, gcs
+from tests.support.processes import gcs
 from tests.support.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
@@ -80,17 +79,14 @@ def listening(system_id: int = 245) -> Generator[Listener]:
         listener.socket.close()
 
 
-def fly(tmp_path: Path, *arguments: str, meanwhile: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], Path]:
+def fly(tmp_path: Path, *arguments: str) -> tuple[dict[str, Any], Path]:
     """A flight of chain3 for three seconds: its summary and its folder."""
     scenario = load(ROOT / "scenarios" / "chain3.toml").model_copy(update={"duration_s": 3.0})
     file, run = tmp_path / "chain3.toml", tmp_path / "run"
     file.write_text(dump(scenario), encoding="utf-8")
-    command = [*GCS, "fly", str(file), "--listen", "127.0.0.1:0", "--out", str(run), "--json", *arguments]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        meanwhile()
-        out, err = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, err) == (0, "")
-    return json.loads(out), run
+    done = gcs("fly", file, "--listen", "127.0.0.1:0", "--out", run, "--json", *arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout), run
 
 
 def acknowledged(heard: list[bytes]) -> list[int]:
@@ -155,7 +151,10 @@ def test_mavsdk_on_a_mirror_finds_every_vehicle_and_its_position(tmp_path: Path)
             until(lambda: other.system_count() == 3, "three systems")
             telemetry.update({system.get_system_id(): Telemetry(system) for system in other.get_systems()})
 
-        summary, run = fly(tmp_path, "--mirror", f"127.0.0.1:{port}", meanwhile=discover)
+        meanwhile = threading.Thread(target=discover)
+        meanwhile.start()
+        summary, run = fly(tmp_path, "--mirror", f"127.0.0.1:{port}")
+        meanwhile.join()
         found = {system_id: told.position_velocity_ned() for system_id, told in telemetry.items()}
     ends_m = {int(row["system_id"]): float(row["north_m"]) for row in read_ticks(run)}
     assert sorted(found) == [1, 2, 3]

@@ -25,7 +25,7 @@ from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
 from scenarios.signing.stamps import Stamps, open_stamps
 from tests.support.paths import SCENARIOS
-from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, short, until
+from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, gcs, short, until
 from tests.support.signed_peer import KEY, OTHER_KEY, position
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
@@ -97,10 +97,9 @@ def test_after_a_kill_another_station_with_the_key_takes_over(tmp_path: Path) ->
     process.kill()
     process.communicate(timeout=PATIENCE_S)
     try:
-        again = fly(scenario, "--listen", listen, "--key", key_file, "--out", second, "--json")
-        out, err = again.communicate(timeout=PATIENCE_S)
-        assert (again.returncode, err) == (0, "")
-        assert json.loads(out)["refused"] == {}
+        again = gcs("fly", scenario, "--listen", listen, "--key", key_file, "--out", second, "--json")
+        assert (again.returncode, again.stderr) == (0, "")
+        assert json.loads(again.stdout)["refused"] == {}
         assert not (second / "vehicles.log").exists()  # it started none
     finally:
         for pid in children_named(str(first)):
@@ -114,8 +113,7 @@ def test_vehicles_whose_timestamps_are_taken_end_the_flight_saying_so(
     make_key(key_file)
     held = open_stamps(tmp_path / "key.vehicles")  # as by vehicles at another port
     options = ("--listen", f"127.0.0.1:{free_port()}", "--key", key_file, "--out", tmp_path / "run", "--json")
-    out, _ = fly(short(tmp_path, "chain3", 1.0), *options).communicate(timeout=PATIENCE_S)
-    summary = json.loads(out)
+    summary = json.loads(gcs("fly", short(tmp_path, "chain3", 1.0), *options).stdout)
     said = f"{tmp_path}/key.vehicles: another process uses it, wanted a separate key for each process"
     assert (summary["verdict"], summary["reason"]) == ("aborted", f"vehicles ended: sim-vehicles: {said}")
     assert len(held.known) == 0
@@ -125,8 +123,8 @@ def test_vehicles_whose_timestamps_are_taken_end_the_flight_saying_so(
 def test_an_unsigned_port_that_others_can_reach_is_warned_of(tmp_path: Path, signed: bool) -> None:
     make_key(tmp_path / "key")
     key = ["--key", tmp_path / "key"] if signed else []
-    process = fly(short(tmp_path, "chain3", 0.2), "--listen", "0.0.0.0:0", *key, "--out", tmp_path / "run", "--json")
-    _, err = process.communicate(timeout=PATIENCE_S)
+    options = ("--listen", "0.0.0.0:0", *key, "--out", tmp_path / "run", "--json")
+    err = gcs("fly", short(tmp_path, "chain3", 0.2), *options).stderr
     warned = err.startswith("warning: 0.0.0.0:") and err.endswith("--key\n") and err.count("\n") == 1
     assert (warned, err == "") == (not signed, signed)
 

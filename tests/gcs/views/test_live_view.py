@@ -17,7 +17,7 @@ from gcs.views import viewer
 from gcs.views.recording import length_s
 from scenarios.files import dump, load
 from tests.support.paths import SCENARIOS
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S, gcs
 
 pytestmark = pytest.mark.xdist_group("processes")
 needs_vulkan = pytest.mark.skipif(viewer.vulkan_missing(), reason="no Vulkan driver to draw with")
@@ -48,8 +48,7 @@ def headless(folder: Path) -> Generator[str]:
 def fly(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     file = folder / "chain3.toml"
     file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0})))
-    command = [sys.executable, "-m", "gcs", "fly", file, "--virtual", "--out", folder / "run", *options]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    return gcs("fly", file, "--virtual", "--out", folder / "run", *options)
 
 
 @needs_vulkan

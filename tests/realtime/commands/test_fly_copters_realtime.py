@@ -13,7 +13,7 @@ import pytest
 
 from scenarios import files
 from tests.support.paths import SCENARIOS
-from tests.support.processes import free_port
+from tests.support.processes import free_port, gcs
 
 COPTERS5 = SCENARIOS / "copters5.toml"
 RUN_S = 80.0
@@ -38,11 +38,8 @@ def test_arducopters_and_px4_started_elsewhere_are_identified_and_flown(tmp_path
     scenario = scenario.model_copy(update={"vehicles": tuple(mixed), "duration_s": 10.0, "altitude_m": 5.0})
     file, port = tmp_path / "copters.toml", free_port()
     file.write_text(files.dump(scenario), encoding="utf-8")
-    command = [sys.executable, "-m", "gcs.cli.main", "fly", str(file), "--connect", f"127.0.0.1:{port}", "--json"]
     with vehicles_of(file, port):
-        done = subprocess.run(
-            [*command, "--out", str(tmp_path / "run")], capture_output=True, text=True, timeout=RUN_S, check=False
-        )
+        done = gcs("fly", file, "--connect", f"127.0.0.1:{port}", "--json", "--out", tmp_path / "run")
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads(done.stdout)
     assert summary["verdict"] == "stable"

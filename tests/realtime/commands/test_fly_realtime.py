@@ -54,10 +54,9 @@ def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtyp
 def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, delay_s: float) -> None:
     folder = tmp_path / "run"
     scenario = short(tmp_path, "triangle5", 8.0)
-    process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", str(delay_s), "--out", folder, "--json")
-    out, err = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, err) == (0, "")
-    summary = json.loads(out)
+    done = gcs("fly", scenario, "--listen", "127.0.0.1:0", "--link-delay", str(delay_s), "--out", folder, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    summary = json.loads(done.stdout)
     assert summary == json.loads((folder / "summary.json").read_text())
     assert summary["verdict"] == "stable"
     ticks = read_ticks(folder)
@@ -103,10 +102,9 @@ def check_tlog(file: Path) -> list[tuple[int, Any]]:
 def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     scenario = short(tmp_path, "triangle5", 20.0)
-    process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", "0.4", "--out", folder)
-    out, _ = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 1
-    assert "verdict  unstable: broken: spacing error of vehicle" in out
+    done = gcs("fly", scenario, "--listen", "127.0.0.1:0", "--link-delay", "0.4", "--out", folder)
+    assert done.returncode == 1
+    assert "verdict  unstable: broken: spacing error of vehicle" in done.stdout
     summary = json.loads((folder / "summary.json").read_text())
     assert {vehicle["mode_final"] for vehicle in summary["vehicles"]} == {"FAILSAFE"}
     assert summary["headroom_min"] < 0
@@ -156,14 +154,12 @@ def test_after_a_kill_logs_are_readable_and_vehicles_taken_back(tmp_path: Path) 
         assert 0 <= killed_ns - ticks["due_ns"][-1] < 1e9
         for options, flown in ((["--link-delay", "0.4"], "fly triangle5 with other links"), ([], "fly triangle5,")):
             another = scenario if options else short(tmp_path, "chain3", 10.0)
-            refused = fly(another, "--listen", listen, "--out", tmp_path / "refused", *options)
-            out, err = refused.communicate(timeout=PATIENCE_S)
-            assert (refused.returncode, out, err.count("\n")) == (2, "", 1)
-            assert flown in err
-        again = fly(scenario, "--listen", listen, "--out", second, "--json")
-        out, err = again.communicate(timeout=PATIENCE_S)
-        assert (again.returncode, err) == (0, "")
-        summary = json.loads(out)
+            refused = gcs("fly", another, "--listen", listen, "--out", tmp_path / "refused", *options)
+            assert (refused.returncode, refused.stdout, refused.stderr.count("\n")) == (2, "", 1)
+            assert flown in refused.stderr
+        again = gcs("fly", scenario, "--listen", listen, "--out", second, "--json")
+        assert (again.returncode, again.stderr) == (0, "")
+        summary = json.loads(again.stdout)
         assert (summary["verdict"], summary["fleet"]) == ("stable", "taken over: they were there already")
         assert not (second / "vehicles.log").exists()  # it started none
         until(lambda: not children_named(str(first)))  # and has ended those it took over
@@ -241,10 +237,9 @@ def test_onboard_loops_keep_vehicles_in_place_until_a_station_returns(
     process.communicate(timeout=PATIENCE_S)
     try:
         until(lambda: vehicles_log(first).count("failsafe") >= 3)
-        again = fly(scenario, "--listen", listen, "--out", second, "--json")
-        out, err = again.communicate(timeout=PATIENCE_S)
-        assert (again.returncode, err) == (0, "")
-        summary = json.loads(out)
+        again = gcs("fly", scenario, "--listen", listen, "--out", second, "--json")
+        assert (again.returncode, again.stderr) == (0, "")
+        summary = json.loads(again.stdout)
         assert (summary["verdict"], summary["loop"]) == ("stable", "onboard")
         assert summary["settling_time_s"] == 0.0  # they had kept their places
         # the links' 160 ms, and up to two periods until states of all vehicles are there
@@ -278,12 +273,11 @@ def test_gains_are_chosen_for_links_measured_just_before_the_flight(tmp_path: Pa
     file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update=update)), encoding="utf-8")
     vehicles = [sys.executable, "-m", "sim_vehicles.drive.cli", file, "--station", at]
     with subprocess.Popen(vehicles, stdout=subprocess.DEVNULL) if connected else nullcontext() as running:
-        process = fly(file, "--connect" if connected else "--listen", at, "--out", folder, "--json")
-        out, err = process.communicate(timeout=PATIENCE_S)
+        done = gcs("fly", file, "--connect" if connected else "--listen", at, "--out", folder, "--json")
         if running is not None:
             running.terminate()
-    assert (process.returncode, err) == (0, "")
-    summary, design = json.loads(out), json.loads((folder / "design.json").read_text())
+    assert (done.returncode, done.stderr) == (0, "")
+    summary, design = json.loads(done.stdout), json.loads((folder / "design.json").read_text())
     measured = design["for_link"]
     assert (measured["source"], measured["vehicles"]) == ("the 5 s before the flight", [1, 2, 3])
     # within a control period: where telemetry falls between two ticks is drawn, and in a flight it stays
