@@ -21,7 +21,7 @@ from tests.soak.soak_judge import Result, fly_numbers, judge
 
 warnings.simplefilter("error")
 BATCH = 8
-"""How many flights a process takes at a time."""
+"""The most flights that a process takes at a time."""
 
 
 def fly_all(seed: int, numbers: range, workers: int) -> Iterator[tuple[int, Result]]:
@@ -31,7 +31,8 @@ def fly_all(seed: int, numbers: range, workers: int) -> Iterator[tuple[int, Resu
             yield from fly_numbers(seed, [number])
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        batches = [list(numbers[k : k + BATCH]) for k in range(0, len(numbers), BATCH)]
+        size = min(BATCH, -(-len(numbers) // workers))
+        batches = [list(numbers[k : k + size]) for k in range(0, len(numbers), size)]
         for future in as_completed([pool.submit(fly_numbers, seed, batch) for batch in batches]):
             yield from future.result()
 
@@ -53,7 +54,7 @@ def soak(results: Iterable[tuple[int, Result]], count: int, seed: int, folder: P
             text = f"{done} of {count} flights, {len(failed)} broken, {left_s:.0f} s left"
             print(text, file=sys.stderr, end="\r" if sys.stderr.isatty() else "\n", flush=True)
     taken_s = time.monotonic() - began_s
-    for text, times in sorted(counts.items(), key=lambda entry: (entry[0].split(":")[0], -entry[1])):
+    for text, times in sorted(counts.items(), key=lambda entry: (entry[0].split(":")[0], -entry[1], entry[0])):
         print(f"{times:7d}  {text}")
     print(f"{count} flights of seed {seed} in {taken_s:.0f} s; {len(failed)} broke an invariant: {sorted(failed)}")
     return len(failed)

@@ -17,6 +17,7 @@ from pydantic import BaseModel
 from gcs.plan.planner import flight_plan
 from scenarios import files, schema
 from scenarios.schema import Clocks, Control, FixedGains, Limits, Rates, Scenario
+from tests.soak.__main__ import fly_all, soak
 from tests.soak.soak_checks import checked
 from tests.soak.soak_experiments import Experiment, experiment, whole
 from tests.soak.soak_flight import Flown, fly
@@ -142,8 +143,11 @@ def test_an_experiment_is_read_back_as_it_was_saved(tmp_path: Path) -> None:
         assert files.load(file) == drawn.scenario
 
 
-def test_two_workers_fly_what_one_flies() -> None:
-    command = [sys.executable, "-m", "tests.soak", "--flights", "4", "--seed", str(SEED), "--workers"]
-    told = [subprocess.run([*command, n], cwd=ROOT, capture_output=True, text=True, check=True).stdout for n in "12"]
-    assert re.sub(r"in \d+ s", "", told[0]) == re.sub(r"in \d+ s", "", told[1])
-    assert "4 flights" in told[0]
+def test_two_workers_fly_what_one_flies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    numbers = range(18, 22)  # short flights
+    assert soak(fly_all(SEED, numbers, 1), len(numbers), SEED, tmp_path) == 0
+    one = capsys.readouterr().out
+    command = [sys.executable, "-m", "tests.soak", "--first", "18", "--flights", "4", "--seed", str(SEED)]
+    two = subprocess.run([*command, "--workers", "2"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert re.sub(r"in \d+ s", "", one) == re.sub(r"in \d+ s", "", two)
+    assert "4 flights" in one
