@@ -130,7 +130,8 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     unlike = Links(up=Link(delay_s=0.02), down=slow, vehicles=(VehicleLinks(system_id=3, up=slow),))
     load["two way"] = load["two way"].model_copy(update={"links": unlike})
     planned = (over_own_links(*flight_plan(scenario)) for scenario in load.values())
-    designs = (with_bounds(with_spread(with_trade_off(design), plan), plan.scenario) for design, plan in planned)
+    designs = [with_bounds(with_spread(design, plan), plan.scenario) for design, plan in planned]
+    designs[0] = with_trade_off(designs[0])
     link = LinkPart(
         source="runs/log", vehicles=(1,), loop_delay_s_least=0.1, loop_delay_s_p50=0.2, loop_delay_s_worst=0.3,
         headroom=0.3, lost_share=0.2, maximised="alpha", chosen="", candidates=(GainsAtDelay(prediction=True),),
