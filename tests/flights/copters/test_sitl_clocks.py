@@ -1,6 +1,7 @@
 """Ten minutes with simulated copters whose clocks lie as those of a real ArduCopter in SITL do."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.drive.lockstep import START_NS
+from gcs.plan.design import Design
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from scenarios.keys.autopilot import Sitl
@@ -27,12 +30,14 @@ def two(**changes: Any) -> Scenario:
     return COPTERS5.model_copy(update=own | {"autopilot": autopilot})
 
 
-DESIGN, PLAN = flight_plan(two())
+@cache
+def planned() -> tuple[Design, FlightPlan]:
+    return flight_plan(two())
 
 
 def flown(duration_s: float, **changes: Any) -> Flight:
     scenario = two(**changes).model_copy(update={"duration_s": duration_s})
-    return fly(replace(PLAN, scenario=scenario))
+    return fly(replace(planned()[1], scenario=scenario))
 
 
 def test_ten_minutes_of_lying_clocks_show_no_jump_and_no_negative_delay() -> None:
@@ -43,7 +48,7 @@ def test_ten_minutes_of_lying_clocks_show_no_jump_and_no_negative_delay() -> Non
     assert 38.0 < (float(rows["due_ns"][0]) - START_NS) * 1e-9 < 44.0  # a cold start as measured, take-off included
     for name in ("up_delay_s", "down_delay_s", "loop_delay_s"):
         assert np.nanmin(rows[name]) >= 0.0
-    summary = summarise(flight.station.plan.scenario, DESIGN, flight.ticks, flight.events)
+    summary = summarise(flight.station.plan.scenario, planned()[0], flight.ticks, flight.events)
     assert summary.loop_delay_bound_s is not None
     assert 0.005 < summary.loop_delay_bound_s < 0.015
     # 0.3 ms each way, and at most a period of waiting: what is shown misses it by no more than the bound

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from scenarios.keys.link import Link, Links
@@ -39,11 +41,13 @@ def column(*, clock_jumps: tuple[ClockJump, ...], timesync_hz: float = 10.0, fla
     return COPTERS5.model_copy(update=changes | {"rates": rates})
 
 
-PLAN = flight_plan(column(clock_jumps=()))[1]
+@cache
+def planned() -> FlightPlan:
+    return flight_plan(column(clock_jumps=()))[1]
 
 
 def flown(**changes: Any) -> Flight:
-    return fly(replace(PLAN, scenario=column(**changes)))
+    return fly(replace(planned(), scenario=column(**changes)))
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
@@ -107,14 +111,14 @@ class BackdatedReplies:
 
 
 def ticks_of(scenario: Scenario, vehicles: BackdatedReplies, station: Station) -> Iterator[Any]:
-    return fly_lockstep(replace(PLAN, scenario=scenario), station=station, vehicles=vehicles)
+    return fly_lockstep(replace(planned(), scenario=scenario), station=station, vehicles=vehicles)
 
 
 def test_replies_that_are_dated_back_are_not_taken_for_jumps() -> None:
     """ArduCopter dates them back by up to 3.5 ms; on direct links up to half of the exchanges contradict the rest."""
     direct = column(clock_jumps=()).model_copy(update={"links": Links(up=Link(delay_s=1e-4), down=Link(delay_s=1e-4))})
     station, vehicles = (
-        Station(replace(PLAN, scenario=direct), start_ns=START_NS),
+        Station(replace(planned(), scenario=direct), start_ns=START_NS),
         BackdatedReplies(Fleet(direct, START_NS)),
     )
     rows = np.concatenate(list(ticks_of(direct, vehicles, station)))
