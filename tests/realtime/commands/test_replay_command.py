@@ -20,6 +20,7 @@ import select, sys, time
 from pymavlink import mavutil
 link = mavutil.mavlink_connection("udpin:127.0.0.1:" + sys.argv[1])
 link.setup_logfile(sys.argv[2])
+select.select([link.fd], [], [], 60.0)  # until the vehicles are up
 end = time.monotonic() + 4.0
 while time.monotonic() < end:
     select.select([link.fd], [], [], 0.1)
