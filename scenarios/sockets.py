@@ -1,7 +1,7 @@
 """Kernels that read and write UDP sockets without making an object for each datagram.
 
-They call the C library with the layouts of 64-bit Linux. One array of 64-bit integers holds all arguments and results:
-a `struct msghdr`, then an `iovec`, the ancillary data, a `sockaddr_in` and a `timespec`.
+They call the C library with the layouts of 64-bit Linux. One array of 64-bit integers, the words, holds all arguments
+and results: a `struct msghdr`, then an `iovec`, the ancillary data, a `sockaddr_in` and a `timespec`.
 """
 
 import errno
@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenarios.kernel import kernel
+from scenarios.kernel import int64, kernel
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
 _LONGEST_DATAGRAM = 2048
-_MOST_DATAGRAMS, _MOST_BYTES = 4096, 1 << 20
+MOST_DATAGRAMS, _MOST_BYTES = 4096, 1 << 20
 """Limits of one read; the rest waits in the sockets."""
 NO_ADDRESS = -1
 """Stands for the number of an address where the socket is connected."""
@@ -29,8 +29,9 @@ NS_PER_S = 1_000_000_000
 _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _EAGAIN, _REFUSED = errno.EAGAIN, errno.ECONNREFUSED
 _DONTWAIT, _REALTIME, _MONOTONIC, _IPV4 = 0x40, 0, 1, 2
-_NAME, _VECTOR, _CONTROL, _CLOCK, _WORDS = 7, 9, 11, 19, 21
-"""Where the parts of the array begin, and its length."""
+_NAME, _VECTOR, _CONTROL, _CLOCK, _EMPTIED, OFFSET, _WORDS = 7, 9, 11, 19, 21, 22, 23
+"""Where the parts of the array begin, and its length. Last come the time at which all sockets were last empty and the
+offset from the monotonic clock to ns since 1970, when they were last read."""
 _NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
 _48_BITS, _LONGEST_NS = 0xFFFFFFFFFFFF, 2**63 - 1
 
@@ -92,24 +93,30 @@ def stamped(own: socket.socket) -> socket.socket:
     return own
 
 
+class Buffers(NamedTuple):
+    """What kernels read into: see `Batch`, whose rows are the first ones of `table`, and the words."""
+
+    stream: Bytes
+    table: Ints
+    words: Ints
+
+
 class Reader:
     """Reads sockets that are `stamped`, at most `most_of_each` datagrams from each at once."""
 
-    def __init__(self, most_of_each: int = _MOST_DATAGRAMS) -> None:
+    def __init__(self, most_of_each: int = MOST_DATAGRAMS) -> None:
         self._most = most_of_each
-        self._buffers = np.empty(_MOST_BYTES, np.uint8), np.empty((5, _MOST_DATAGRAMS), np.int64), _words()
-        self._emptied_ns = time.monotonic_ns()
+        self.buffers = Buffers(np.empty(_MOST_BYTES, np.uint8), np.empty((5, MOST_DATAGRAMS), np.int64), _words())
+        self.buffers.words[_EMPTIED] = time.monotonic_ns()
 
     def read(self, descriptors: Sequence[int] | Ints) -> Batch:
         """The datagrams that have arrived at these sockets; no other sockets may have unread datagrams."""
-        begin_ns, to_monotonic_ns = time.monotonic_ns(), -_offset_ns(self._buffers[2])
-        count, end, errors, empty = _read(np.asarray(descriptors, np.int64), self._most, *self._buffers)
-        read_ns = time.monotonic_ns()
-        stream, table = self._buffers[0][:end].copy(), self._buffers[1][:, :count].copy()
-        _to_monotonic(table[3], to_monotonic_ns, self._emptied_ns, read_ns)
-        if empty:
-            self._emptied_ns = begin_ns
-        return Batch(stream, table, read_ns, errors)
+        return batch(self.buffers, *read_all(np.asarray(descriptors, np.int64), self._most, self.buffers))
+
+
+def batch(buffers: Buffers, count: int, end: int, errors: int, read_ns: int) -> Batch:
+    """A copy of what `read_all` has read into the buffers; the other arguments are its results."""
+    return Batch(buffers.stream[:end].copy(), buffers.table[:, :count].copy(), read_ns, errors)
 
 
 def write(stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> tuple[Ints, int, int]:
@@ -159,11 +166,29 @@ def _offset_ns(words: Ints) -> int:
     """The offset by the quickest of three readings of both clocks, as the process may be interrupted between them."""
     quickest_ns, offset_ns = _LONGEST_NS, 0
     for _ in range(3):
-        before_ns, real_ns = _clock_ns(_MONOTONIC, words), _clock_ns(_REALTIME, words)
-        after_ns = _clock_ns(_MONOTONIC, words)
+        before_ns, real_ns, after_ns = monotonic_ns(words), _clock_ns(_REALTIME, words), monotonic_ns(words)
         if after_ns - before_ns < quickest_ns:
             quickest_ns, offset_ns = after_ns - before_ns, real_ns - (before_ns + after_ns) // 2
     return offset_ns
+
+
+@kernel
+def monotonic_ns(words: Ints) -> int:
+    """The time on the monotonic clock."""
+    return _clock_ns(_MONOTONIC, words)
+
+
+@kernel
+def read_all(descriptors: Ints, most: int, buffers: Buffers) -> tuple[int, int, int, int]:
+    """Read at most `most` datagrams from each socket; returns the last arguments of `batch`."""
+    words = buffers.words
+    begin_ns, words[OFFSET] = monotonic_ns(words), _offset_ns(words)
+    count, end, errors, empty = _read(descriptors, most, buffers.stream, buffers.table, words)
+    read_ns = monotonic_ns(words)
+    _to_monotonic(buffers.table, count, -words[OFFSET], words[_EMPTIED], read_ns)
+    if empty:
+        words[_EMPTIED] = begin_ns
+    return count, end, errors, read_ns
 
 
 @kernel
@@ -196,14 +221,14 @@ def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints)
 
 
 @kernel
-def _to_monotonic(stamps_ns: Ints, offset_ns: int, emptied_ns: int, read_ns: int) -> None:
-    """Convert the stamps of datagrams, 0 where there is none, to the monotonic clock, in place.
+def _to_monotonic(table: Ints, count: int, offset_ns: int, emptied_ns: int, read_ns: int) -> None:
+    """Convert the stamps of `count` datagrams, 0 where there is none, to the monotonic clock, in place.
 
     The stamps jump if the wall clock is set, so they are clipped: nothing arrived before the sockets were last empty.
     """
-    for k in range(len(stamps_ns)):
-        stamp_ns = stamps_ns[k] + offset_ns if stamps_ns[k] else read_ns
-        stamps_ns[k] = min(max(stamp_ns, emptied_ns), read_ns)
+    for k in range(count):
+        stamp_ns = table[3, k] + offset_ns if table[3, k] else read_ns
+        table[3, k] = min(max(stamp_ns, emptied_ns), read_ns)
 
 
 @kernel
@@ -211,18 +236,28 @@ def _write(
     stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, sent_ns: Ints, words: Ints
 ) -> tuple[int, int]:
     """Send datagrams; returns how many met a closed port, and how many failed otherwise."""
-    base = words.ctypes.data
     refused = failed = 0
     for k in range(len(begins)):
-        name = size = 0
-        if addresses[k] != NO_ADDRESS:
-            words[_NAME], words[_NAME + 1] = addresses[k] << 16 | _IPV4, 0
-            name, size = base + 8 * _NAME, _NAME_BYTES
         place = stream.ctypes.data + begins[k]
-        sent_ns[k] = _clock_ns(_MONOTONIC, words)  # before: an answer may come before the call returns
-        if _sendto(descriptors[k], place, ends[k] - begins[k], _DONTWAIT, name, size) < 0:
-            if _errno()[0] == _REFUSED:
-                refused += 1
-            else:
-                failed += 1
+        sent_ns[k], error = send(place, ends[k] - begins[k], descriptors[k], addresses[k], words)
+        if error == _REFUSED:
+            refused += 1
+        elif error:
+            failed += 1
     return refused, failed
+
+
+@kernel
+def send(place: int, size: int, descriptor: int, address: int, words: Ints) -> tuple[int, int]:
+    """Send the bytes at a place in memory to the address with this number, or to the socket's peer.
+
+    Returns when they were handed to the operating system, and its error number, or 0.
+    """
+    name = name_size = 0
+    if address != NO_ADDRESS:
+        words[_NAME], words[_NAME + 1] = address << 16 | _IPV4, 0
+        name, name_size = words.ctypes.data + 8 * _NAME, _NAME_BYTES
+    sent_ns = monotonic_ns(words)  # before: an answer may come before the call returns
+    if _sendto(descriptor, place, size, _DONTWAIT, name, name_size) < 0:
+        return sent_ns, int64(_errno()[0])
+    return sent_ns, 0

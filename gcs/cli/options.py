@@ -261,7 +261,7 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
     if key is None:
         return None
     from gcs.drive.guard import open_guard
-    from gcs.drive.udp import realtime_offset_ns
+    from scenarios.sockets import realtime_offset_ns
 
     return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
 

@@ -4,14 +4,14 @@ In most flights nearly all steps are of this kind. Where the kernel stops, for e
 or changes its mode, a step in Python continues from there (`gcs.drive.lockstep`).
 """
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from gcs.control.tick import TICK, TickArray
-from gcs.link.datagram import Address, Arrivals
-from gcs.station.fast_path import DONE, NOT_JUDGED, WITH_TICK, FastPathData, Sending, fast_step
+from gcs.link.datagram import Arrivals
+from gcs.station.fast_path import DONE, NOT_JUDGED, WITH_TICK, FastPathData, Sending, fast_rows, fast_step
 from gcs.station.station import Station
 from scenarios.kernel import Columns, Records, array_kernel, kernel
 from scenarios.sockets import Bytes, Ints
@@ -69,8 +69,8 @@ class Ends(NamedTuple):
     data: FastPathData
     places: Ints
     """The row in the fleet of each of the station's vehicles."""
-    senders: Ints
-    """The result of `Reception.numbered` for the fleet's vehicles."""
+    addresses: Ints
+    """The address of each vehicle of the fleet."""
     wire: LinkBuffers
 
 
@@ -88,9 +88,7 @@ class FastPath:
     With `ahead`, several ticks are flown before their rows are yielded, and received frames are not passed on.
     """
 
-    def __init__(
-        self, station: Station, fleet: Fleet, addresses: Sequence[Address], places: Ints, *, ahead: bool
-    ) -> None:
+    def __init__(self, station: Station, fleet: Fleet, addresses: Ints, places: Ints, *, ahead: bool) -> None:
         self._station, self._fleet, self._addresses, self._places = station, fleet, addresses, places
         most, n = _STEPS * fleet.most_leaving, len(places)
         self._room, self._ahead = most - fleet.most_leaving, ahead
@@ -118,11 +116,11 @@ class FastPath:
             return Stopped(now_ns, self._fleet.step(entering, now_ns), 0)
         wire.sent[: entering.stream.size], wire.to[:, : len(entering)] = entering.stream, entering.table
         state["sent"][0], state["sent_bytes"][0], state["next_ns"][0] = len(entering), entering.stream.size, now_ns
-        data, senders = station.fast_path_data, station.senders(self._addresses)
+        data = station.fast_path_data
         arrived, ticks, left = state["arrived"], state["ticks"], _NOT_YET
 
         def run(left: int) -> int:
-            ends = Ends(self._fleet.arrays, data, self._places, senders, wire)
+            ends = Ends(self._fleet.arrays, data, self._places, self._addresses, wire)
             if self._handle is None or not _same(ends, self._handle.kept):
                 self._handle = handle(ends)  # the vehicles' part in Python may have replaced arrays
             return _fly(self._handle, self._room, self._ahead, left)
@@ -139,7 +137,7 @@ class FastPath:
             if ticks[0]:
                 yield self._row_bytes[: ticks[0] * self._tick_bytes].copy().view(TICK)
             if how_far == NOT_JUDGED:
-                tick = station.unjudged(state["now_ns"][0], np.zeros(len(self._places), np.int64))
+                tick = station.unjudged(np.zeros(len(self._places), np.int64))
                 yield station.complete(tick, [tick.due_ns])
             if how_far == NOT_LEFT:
                 return Stopped(state["now_ns"][0], self._fleet.left(left, state["now_ns"][0]), 0)
@@ -151,7 +149,9 @@ class FastPath:
     def _pass_on(self, count: int) -> None:
         """Add the first `count` arrived datagrams to the station's frames, if wanted, and empty their buffer."""
         if count and not self._ahead:
-            self._station.frames.add(Arrivals(*self._arrived(0, count), self._wire.none_queued, self._addresses))
+            stream, table = self._arrived(0, count)
+            table[2] = self._addresses[table[2]]
+            self._station.frames.add(Arrivals(stream, table, self._wire.none_queued))
         self._state["arrived"][0] = self._state["arrived_bytes"][0] = 0
 
     def _arrived(self, first: int, stop: int) -> tuple[Bytes, Ints]:
@@ -206,7 +206,7 @@ def _fly(ends: Any, room: int, ahead: bool, left: int) -> int:
 @array_kernel
 def _step(ends: Any, leaving: int) -> int:
     """Do one step as far as it needs no Python; returns its progress as a code. For `leaving` see `left` of `_fly`."""
-    fleet, data, places, senders, wire = ends.arrays
+    fleet, data, places, addresses, wire = ends.arrays
     state, n = wire.state[0], len(places)
     now_ns, ticks = state.now_ns, state.ticks
     if leaving == _NOT_YET:
@@ -219,11 +219,13 @@ def _step(ends: Any, leaving: int) -> int:
             state.entered, state.waiting, state.leaving = entered, waiting, leaving
             return NOT_LEFT
     data.schedule[0].now_ns = now_ns
-    table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving)
+    table = _arrive(wire, fleet.leaving, fleet.leaving_data, leaving, addresses)
     how_far, state.taken, first, second, third = fast_step(
-        data, wire.arrived, table, wire.none_queued[:leaving], senders,
-        wire.rows[ticks * n : (ticks + 1) * n],
+        data, wire.arrived, table, wire.none_queued[:leaving]
     )  # fmt: skip
+    rows = wire.rows[ticks * n : (ticks + 1) * n]
+    if how_far == WITH_TICK and not fast_rows(data, np.full(n, now_ns), rows):
+        how_far = NOT_JUDGED
     state.sent = state.sent_bytes = 0
     _send(wire, first, places, now_ns)
     _send(wire, second, places, now_ns)
@@ -234,8 +236,11 @@ def _step(ends: Any, leaving: int) -> int:
 
 
 @array_kernel
-def _arrive(wire: LinkBuffers, leaving: Ints, data: Bytes, count: int) -> Ints:
-    """Add `count` datagrams that leave the links to the arrivals, in order of time and row; returns their table."""
+def _arrive(wire: LinkBuffers, leaving: Ints, data: Bytes, count: int, addresses: Ints) -> Ints:
+    """Add `count` datagrams that leave the links to the arrivals, in order of time and row; returns their table.
+
+    Its addresses are those of the vehicles in the rows.
+    """
     state, order = wire.state[0], np.argsort(leaving[3, :count], kind="mergesort")
     before, size = state.arrived_bytes, leaving[1, count - 1] if count else 0
     copy_bytes(wire.arrived, before, data, 0, size)
@@ -244,6 +249,7 @@ def _arrive(wire: LinkBuffers, leaving: Ints, data: Bytes, count: int) -> Ints:
         for part in range(4):
             table[part, place] = leaving[part, order[place]] + (before if part < 2 else 0)
             wire.arrivals[part, state.arrived + place] = table[part, place]
+        table[2, place] = addresses[table[2, place]]
     state.in_step, state.arrived, state.arrived_bytes = count, state.arrived + count, before + size
     return table
 

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from gcs.link import mavlink
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Datagram, Outgoing, network_at
 from gcs.station.reception import ANOTHER_ADDRESS
 from scenarios.signing.keys import Key, read_key
 from scenarios.signing.link import SignedLink
@@ -47,13 +47,13 @@ class Guard:
             def unwanted(system_id: int, datagram: Datagram = datagram) -> str:
                 return ANOTHER_ADDRESS if is_another is not None and is_another(system_id, datagram) else ""
 
-            good = self._link(datagram.address[2]).verify(datagram.data, now_ns, refused, unwanted)
+            good = self._link(network_at(datagram.address)).verify(datagram.data, now_ns, refused, unwanted)
             if good:
                 verified.append(Datagram(good, *datagram[1:]))
         return verified
 
     def sent(self, outgoing: Iterable[Outgoing], now_ns: int) -> list[Outgoing]:
-        return [(self._link(address[2]).sign(data, now_ns), address) for data, address in outgoing]
+        return [(self._link(network_at(address)).sign(data, now_ns), address) for data, address in outgoing]
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:

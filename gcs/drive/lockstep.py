@@ -18,8 +18,9 @@ from gcs.control.phases import Phase
 from gcs.control.tick import TickArray
 from gcs.drive.fast_path import FastPath
 from gcs.drive.guard import Guard
+from gcs.drive.udp_fast_path import UdpFastPath, no_wire
 from gcs.link import datagram
-from gcs.link.datagram import Address, Arrivals, Logged, Outbox
+from gcs.link.datagram import NETWORK_BIT, NUMBER_BITS, Address, Arrivals, Logged, Outbox
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import tlog_entries
 from gcs.station.station import Station
@@ -38,7 +39,6 @@ START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start. It is not zero, to expose times that were never set."""
 EPOCH_NS = 1_800_000_000 * 1_000_000_000
 """Virtual time 0 of a signed flight, in ns since 1970."""
-_HOST = "virtual"
 _FLIGHTS_A_COLLECTION = 100
 """Flights between garbage collections. Freezing postpones them, in campaigns of short flights indefinitely."""
 _flights = count(1)
@@ -68,7 +68,7 @@ class RecordedVehicles:
         self._sent: list[Logged] = []
 
     def step(self, received: Sent, now_ns: int) -> Sent:
-        self._sent += [(data, time_ns, (_HOST, key, network_of(key))) for key, data, time_ns in received]
+        self._sent += [(data, time_ns, virtual_address(key)) for key, data, time_ns in received]
         return self._vehicles.step(received, now_ns)
 
     def take_sent(self) -> list[Logged]:
@@ -121,6 +121,8 @@ def prepare(plan: FlightPlan) -> None:
     for _ in range(_STEPS_TO_PREPARE):
         outbox, _ = station.step([], station.next_event_ns)
         station.sent(outbox, np.zeros(len(outbox), np.int64))
+    if station.has_fast_path:
+        UdpFastPath(station, no_wire(), lambda _network, _entries: None).step()
     station.vehicles[0].frames.restart()  # as after a long silence
     station.vehicles[0].delivery_ns(0, 0)  # as when it reports how long it holds set-points
 
@@ -139,7 +141,7 @@ def fly_lockstep(
     callers that only collect rows.
 
     Pass a station to read its events and end reason afterwards, vehicles to continue an earlier flight, and a guard to
-    sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id, its network).
+    sign and verify at the station's end.
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan.scenario)
@@ -152,25 +154,31 @@ def fly_lockstep(
             gc.collect()
 
 
+def virtual_address(system_id: int) -> Address:
+    """The address of a vehicle in virtual time: its network, and its system id."""
+    return network_of(system_id) << NETWORK_BIT | system_id
+
+
 class _Bridge:
     """Converts datagrams between a station and vehicles, whose rows in the fleet are in order of system id."""
 
     def __init__(self, system_ids: Sequence[int]) -> None:
         self._ids = sorted(system_ids)
-        self.addresses: list[Address] = [(_HOST, key, network_of(key)) for key in self._ids]
-        self._row = {address: row for row, address in enumerate(self.addresses)}
+        self.addresses = np.array([*map(virtual_address, self._ids)])
         self.rows = np.array([self._ids.index(key) for key in system_ids])
         """The row in the fleet of each of the station's vehicles."""
 
     def arrivals(self, sent: Datagrams) -> Arrivals:
-        return Arrivals(sent.stream, sent.table, np.zeros(len(sent), np.int64), self.addresses)
+        begins, ends, rows, times_ns = sent.table
+        table = np.array([begins, ends, self.addresses[rows], times_ns])
+        return Arrivals(sent.stream, table, np.zeros(len(sent), np.int64))
 
     def one_by_one(self, sent: Sent) -> list[datagram.Datagram]:
-        return [datagram.Datagram(data, (_HOST, key, network_of(key)), time_ns) for key, data, time_ns in sent]
+        return [datagram.Datagram(data, virtual_address(key), time_ns) for key, data, time_ns in sent]
 
     def to_vehicles(self, outgoing: Outbox, now_ns: int) -> Datagrams:
-        stream, table = outgoing.packed(self._row.__getitem__, lambda _: self.rows)
-        table[3] = now_ns
+        stream, table = outgoing.packed()
+        table[2], table[3] = self.addresses.searchsorted(table[2]), now_ns
         return Datagrams(stream, table, self._ids)
 
 
@@ -193,7 +201,7 @@ def _ticks(
         if guard is not None:
             datagrams = guard.received(bridge.one_by_one(arrived), now_ns, station.counters, station.is_another)
             outgoing, tick = station.step(datagrams, now_ns)
-            to_vehicles = [(key, data, now_ns) for data, (_, key, _) in guard.sent(outgoing, now_ns)]
+            to_vehicles = [(address & NUMBER_BITS, data, now_ns) for data, address in guard.sent(outgoing, now_ns)]
         else:
             arrivals = bridge.arrivals(arrived) if isinstance(arrived, Datagrams) else bridge.one_by_one(arrived)
             outgoing, tick = station.step(arrivals, now_ns, taken)

@@ -13,7 +13,7 @@ from gcs.control.phases import longest_round_trip_s
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.errors import InputError
 from gcs.link import mavlink
-from gcs.link.datagram import Address, Outgoing
+from gcs.link.datagram import Address, Outgoing, network_at
 from gcs.station.reception import AUTOPILOT_COMPONENT
 from scenarios.files import fingerprint
 from scenarios.networks import wire_id
@@ -112,7 +112,7 @@ class Presence:
             now_ns = clock_ns()  # read before the socket: all that arrived by the deadline is then received
             for datagram in self._link.receive():
                 frames_in = mavlink.decode_either(datagram.data, Counter())
-                for frame in mavlink.in_network(frames_in, datagram.address[2]):
+                for frame in mavlink.in_network(frames_in, network_at(datagram.address)):
                     if frame.system_id in self._wanted and frame.component_id == AUTOPILOT_COMPONENT:
                         self._addresses[frame.system_id] = datagram.address
                         frames.append(frame)

@@ -4,17 +4,29 @@ A batch is one array of bytes and a table of where each datagram begins and ends
 datagram that is read individually.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from scenarios.kernel import Array, kernel
-from scenarios.sockets import Bytes, Ints, joined
+from scenarios.sockets import Bytes, Ints, joined, number_of
 
-Address = tuple[str, int, int]
-"""Host, port and network, which is the number of the station's socket that this address sends to."""
+Address = int
+"""A host, a port and a network, which is the number of the station's socket that the address sends to: see
+`address_at`. 0 is none."""
+NETWORK_BIT, NUMBER_BITS = 48, (1 << 48) - 1
+"""First bit of the network in an address, and the mask of the bits below it, which hold `number_of` host and port."""
+
+
+def address_at(host: str, port: int, network: int = 0) -> Address:
+    return network << NETWORK_BIT | number_of((host, port))
+
+
+def network_at(address: Address) -> int:
+    """The network of an address."""
+    return address >> NETWORK_BIT
 
 
 class Datagram(NamedTuple):
@@ -38,19 +50,17 @@ Logged = tuple[bytes, int, Address]
 class Arrivals:
     """A batch of received or sent datagrams; iterating over it yields `Datagram` objects.
 
-    The rows of `table` (4, n): where each begins and ends in `stream`, the index of its source or destination in
-    `addresses`, and its receive or send time.
+    The rows of `table` (4, n): where each begins and ends in `stream`, the address of its source or destination, and
+    its receive or send time.
     """
 
     stream: Bytes
     table: Ints
     queued_ns: Ints
-    addresses: Sequence[Address]
 
     def datagram(self, place: int) -> Datagram:
-        begin, end, sender, received_ns = self.table[:, place].tolist()
-        data = self.stream[begin:end].tobytes()
-        return Datagram(data, self.addresses[sender], received_ns, self.queued_ns.item(place))
+        begin, end, address, received_ns = self.table[:, place].tolist()
+        return Datagram(self.stream[begin:end].tobytes(), address, received_ns, self.queued_ns.item(place))
 
     def __len__(self) -> int:
         return self.table.shape[1]
@@ -62,10 +72,9 @@ class Arrivals:
 def arrivals_of(datagrams: Sequence[Datagram]) -> Arrivals:
     """The batch that holds these datagrams."""
     data, addresses, received_ns, queued_ns = zip(*datagrams, strict=True) if datagrams else ((), (), (), ())
-    senders = {address: place for place, address in enumerate(dict.fromkeys(addresses))}
     stream, ends = joined(data)
-    table = np.array([ends[:-1], ends[1:], [senders[address] for address in addresses], received_ns], np.int64)
-    return Arrivals(stream, table.reshape(4, -1), np.array(queued_ns, np.int64), [*senders])
+    table = np.array([ends[:-1], ends[1:], addresses, received_ns], np.int64)
+    return Arrivals(stream, table.reshape(4, -1), np.array(queued_ns, np.int64))
 
 
 class Frames:
@@ -81,7 +90,7 @@ class Frames:
         """Add the datagrams from index `first` up to `stop`; each must hold one frame."""
         table = arrivals.table[:, first:stop]
         if table.shape[1]:
-            self.parts.append(Arrivals(arrivals.stream, table, arrivals.queued_ns, arrivals.addresses))
+            self.parts.append(Arrivals(arrivals.stream, table, arrivals.queued_ns))
 
     def take(self, other: "Frames") -> None:
         """Move all frames of another buffer into this one."""
@@ -96,8 +105,8 @@ class Frames:
             if not isinstance(part, Arrivals):
                 yield part
                 continue
-            for begin, end, sender, received_ns in part.table.T.tolist():
-                yield part.stream[begin:end].tobytes(), received_ns, part.addresses[sender]
+            for begin, end, address, received_ns in part.table.T.tolist():
+                yield part.stream[begin:end].tobytes(), received_ns, address
 
 
 @dataclass(slots=True)
@@ -110,7 +119,7 @@ class Block:
     frames: Bytes
     sizes: Ints
     rows: Ints
-    to: Sequence[Address | None]
+    to: Ints
 
 
 class Outbox:
@@ -128,23 +137,18 @@ class Outbox:
         self.parts.append(block)
         self._count += len(block.rows)
 
-    def packed(
-        self, number: Callable[[Address], int], numbers: Callable[[Sequence[Address | None]], Ints]
-    ) -> tuple[Bytes, Ints]:
-        """Its datagrams as the stream and the table of `Arrivals`, with times 0 because they are not yet sent.
-
-        `number` maps one address to its number, `numbers` the addresses of all vehicles to theirs.
-        """
+    def packed(self) -> tuple[Bytes, Ints]:
+        """Its datagrams as the stream and the table of `Arrivals`, with times 0 because they are not yet sent."""
         table, streams = np.zeros((4, len(self)), np.int64), [np.empty(0, np.uint8)]
         place = begin = 0
         for part in self.parts:
             if isinstance(part, Block):
-                _enter(table, place, begin, part.frames.shape[1], part.sizes, part.rows, numbers(part.to))
+                _enter(table, place, begin, part.frames.shape[1], part.sizes, part.rows, part.to)
                 place += len(part.rows)
                 streams.append(part.frames.ravel())
             else:
                 data, address = part
-                table[:3, place] = begin, begin + len(data), number(address)
+                table[:3, place] = begin, begin + len(data), address
                 place += 1
                 streams.append(np.frombuffer(data, np.uint8))
             begin += len(streams[-1])
@@ -157,18 +161,16 @@ class Outbox:
                 continue
             data, width = part.frames.tobytes(), part.frames.shape[1]
             for k, (row, size) in enumerate(zip(part.rows.tolist(), part.sizes.tolist(), strict=True)):
-                address = part.to[row]
-                assert address is not None
-                yield data[k * width : k * width + size], address
+                yield data[k * width : k * width + size], part.to.item(row)
 
     def __len__(self) -> int:
         return self._count
 
 
 @kernel
-def _enter(table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, numbers: Array) -> None:
+def _enter(table: Array, place: int, begin: int, width: int, sizes: Array, rows: Array, to: Array) -> None:
     """Enter frames, one every `width` bytes from `begin` on, into a table of datagrams."""
     for k in range(len(rows)):
         table[0, place + k] = begin + k * width
         table[1, place + k] = begin + k * width + sizes[k]
-        table[2, place + k] = numbers[rows[k]]
+        table[2, place + k] = to[rows[k]]

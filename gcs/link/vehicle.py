@@ -49,8 +49,6 @@ _LONGEST_HOLD_NS = 5 * NS_PER_S
 """A vehicle that holds set-points starts anew if their arrival changes by more than this."""
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
-_NOBODY = -1
-"""Stands for the number of an unknown address."""
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
 FORGET_NUMBERS_NS = 3 * NS_PER_S
@@ -64,7 +62,7 @@ _SILENT_NS = 3 * NS_PER_S
 
 LINK = np.dtype(
     [
-        ("address", "i8"),  # its number in `Links.addresses`, or _NOBODY
+        ("address", "i8"),  # from which it sends; 0: not heard yet
         ("heard_ns", "i8"),  # when the newest valid frame arrived
         ("first_heard_ns", "i8"),  # when the first one arrived, or 0
         ("launched", "?"),  # it has no autopilot: only changes of its heartbeats matter, and it has no global position
@@ -105,17 +103,18 @@ class Links(NamedTuple):
     """Of LINK, (n,)."""
     clocks: Clocks
     counters: Records
-    addresses: dict[Address, int]
-    """The number of each address from which vehicles have sent."""
-    to: list[Address | None]
-    """The address of each vehicle."""
+
+    @property
+    def to(self) -> NDArray[np.int64]:
+        """The address of each vehicle."""
+        return self.known["address"]
 
 
 def new_links(n: int) -> Links:
     """Links over which nothing has been received yet."""
     known = np.zeros(n, LINK)
-    known["address"], known["newest"], known["lag_jumps"] = _NOBODY, True, -1
-    return Links(known, new_clocks(n), new_counters(n), {}, [None] * n)
+    known["newest"], known["lag_jumps"] = True, -1
+    return Links(known, new_clocks(n), new_counters(n))
 
 
 def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key_ms: int) -> Block:
@@ -147,7 +146,7 @@ def heard(known: Records, wanted: Array) -> NDArray[np.int64]:
     """The wanted rows whose vehicles have been heard."""
     rows, found = np.empty(len(known), np.int64), 0
     for row in range(len(known)):
-        if wanted[row] and known[row].address != _NOBODY:
+        if wanted[row] and known[row].address:
             rows[found] = row
             found += 1
     return rows[:found]
@@ -162,7 +161,7 @@ def ask(
     sizes, rows, place = np.empty(count, np.int64), np.empty(count, np.int64), 0
     for turn in range(first, first + count):
         row = turn % len(known)
-        if known[row].address == _NOBODY:
+        if not known[row].address:
             continue
         if now_ns - known[row].heard_ns > SILENCE_S * NS_PER_S:
             clocks[row].unanswered = 0  # it says nothing at all: that is silence
@@ -221,6 +220,8 @@ class RemoteVehicle:
     State that every frame may change is in a row of `links`.
     """
 
+    address = Cell[Address | None](0)
+    """From which it sends; None until it is heard."""
     heard_ns = Cell[int]()
     """When the newest valid frame arrived."""
     first_heard_ns = Cell[int | None](0)
@@ -287,16 +288,6 @@ class RemoteVehicle:
         self._outdated: list[tuple[int, int, bool]] = []
         """For each recent command that changed mode or arming: the time of its ACK, and mode and arming before it. A
         heartbeat sent before the command was executed still reports those."""
-
-    @property
-    def address(self) -> Address | None:
-        return self._links.to[self._row]
-
-    @address.setter
-    def address(self, address: Address | None) -> None:
-        numbers, self._links.to[self._row] = self._links.addresses, address
-        number = _NOBODY if address is None else numbers.setdefault(address, len(numbers))
-        self._links.known["address"][self._row] = number
 
     @property
     def end_mode(self) -> int:

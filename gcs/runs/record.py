@@ -1,6 +1,6 @@
 """Writes the logs of a run in flight: the tick record, the events, the telemetry log.
 
-All three are append-only files, each written with one system call per tick, so a killed process loses nothing that it
+All three are append-only files, each written with few system calls per tick, so a killed process loses nothing that it
 had logged. The live table and the Rerun recording follow the flight by reading these files, so the control loop never
 waits for them.
 """
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from gcs.control.tick import Event, TickArray
-from gcs.link.datagram import Arrivals, Frames
+from gcs.link.datagram import NETWORK_BIT, Arrivals, Frames, network_at
 from scenarios.kernel import Array, kernel
 from scenarios.sockets import Ints
 
@@ -98,7 +98,11 @@ class RunWriter:
         `epoch_ns` is the zero of the frames' times, in ns since 1970.
         """
         for network, entries in tlog_entries(frames, epoch_ns).items():
-            self._add(tlog_file(network), entries)
+            self.entries(network, entries)
+
+    def entries(self, network: int, entries: bytes) -> None:
+        """Append entries to the telemetry log of a network."""
+        self._add(tlog_file(network), entries)
 
     def ended(self, name: str, error: OSError) -> None:
         """Log that a file of the run could not be written, and write no more to it."""
@@ -132,20 +136,14 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
                 _fill(own, part.stream, table, epoch_ns)
                 entries[network].append(own.tobytes())
         else:
-            frame, time_ns, (_, _, network) = part
-            entries[network] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
+            frame, time_ns, address = part
+            entries[network_at(address)] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
     return {network: b"".join(parts) for network, parts in entries.items()}
 
 
 def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
-    numbers = arrivals.table[2].tolist()
-    # `addresses` may hold every sender heard so far, even strangers: look only at those in this table
-    network_of = {number: arrivals.addresses[number][2] for number in set(numbers)}
-    networks = set(network_of.values())
-    if len(networks) == 1:
-        return {networks.pop(): arrivals.table}
-    of_rows = np.array([network_of[number] for number in numbers], np.int64)
-    return {network: arrivals.table[:, of_rows == network] for network in networks}
+    of_rows = arrivals.table[2] >> NETWORK_BIT
+    return {network: arrivals.table[:, of_rows == network] for network in np.unique(of_rows).tolist()}
 
 
 @kernel
@@ -153,13 +151,19 @@ def _fill(entries: Array, stream: Array, table: Array, epoch_ns: int) -> None:
     """Fill the array `entries` with the telemetry log entries of the frames in a table."""
     at = 0
     for k in range(table.shape[1]):
-        stamp_us = (epoch_ns + table[3, k]) // 1000
-        for byte in range(8):
-            entries[at + byte] = stamp_us >> 8 * (7 - byte) & 0xFF
-        at += 8
-        for place in range(table[0, k], table[1, k]):
-            entries[at] = stream[place]
-            at += 1
+        at = add_entry(entries, at, stream, table[0, k], table[1, k], epoch_ns + table[3, k])
+
+
+@kernel
+def add_entry(entries: Array, at: int, stream: Array, begin: int, end: int, time_ns: int) -> int:
+    """Write a frame's telemetry log entry at an index of `entries`, with its time since 1970; returns its end."""
+    for byte in range(8):
+        entries[at + byte] = time_ns // 1000 >> 8 * (7 - byte) & 0xFF
+    at += 8
+    for place in range(begin, end):
+        entries[at] = stream[place]
+        at += 1
+    return at
 
 
 def event_fields(event: Event) -> dict[str, Any]:

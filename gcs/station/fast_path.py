@@ -45,13 +45,14 @@ SCHEDULE = np.dtype(
         ("next_requests_ns", "i8"), ("next_timesync_ns", "i8"),  # the next wake-up for requests, and the next request
         ("timesync_row", "i8"),  # the vehicle to which the next request goes
         ("tick_count", "i8"),
+        ("tick", "i8"), ("due_ns", "i8"), ("time_s", "f8"),  # of the last tick done by a kernel: see `Tick`
         ("start_ns", "i8"), ("period_ns", "i8"), ("timesync_spacing_ns", "i8"), ("requests_apart_ns", "i8"),
     ]
 )  # fmt: skip
 """The station's timetable: when each periodic task is next due."""
 DONE, WITH_TICK, NOT_TAKEN, NOT_DONE, NOT_JUDGED = range(5)
-"""Outcome of a step: done; done with the rows of its tick; only some of its datagrams processed; all of them processed,
-but nothing else done; done except for the rows of its tick, because the formation may be broken."""
+"""Outcome of a step: done; done with a tick; only some of its datagrams processed; all of them processed, but nothing
+else done; done except for the rows of its tick, because the formation may be broken."""
 
 
 class TickLimits(NamedTuple):
@@ -93,13 +94,17 @@ class Scratch(NamedTuple):
     """Of `gcs.link.mavlink.SET_POINT`."""
     rtt_s: FloatArray
     silent: NDArray[np.bool_]
+    followed: NDArray[np.bool_]
+    """Which vehicles follow the control law in this tick."""
     nothing: Sending
     """No frames."""
 
 
 def new_scratch(n: int) -> Scratch:
     nothing = Sending(np.empty((0, 0), np.uint8), np.empty(0, np.int64), np.empty(0, np.int64))
-    return Scratch(np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_), nothing)
+    return Scratch(
+        np.zeros(n, CONTROL), np.zeros(n, SET_POINT), np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_), nothing
+    )
 
 
 class FastPathData(NamedTuple):
@@ -148,31 +153,28 @@ def fast_step(
     stream: Bytes,
     table: Ints,
     queued_ns: Ints,
-    senders: Ints,
-    rows: Records,
 ) -> tuple[int, int, Sending, Sending, Sending]:
     """Do a step, or as much of it as needs no Python, at the schedule's `now_ns`.
 
     Stream, table and `queued_ns` are those of `Arrivals`. Returns the outcome, how many datagrams were processed, and
-    the frames to send, in order. `rows` receives the rows of the tick.
+    the frames to send, in order; requests come last. `fast_rows` completes a tick.
     """
     schedule, tables = data.schedule[0], data.tables
     nothing, taken = data.scratch.nothing, 0
     if NEWS_OF_A_FRAME * table.shape[1] > len(tables.news):
         return NOT_TAKEN, taken, nothing, nothing, nothing
     now = Now(schedule.now_ns, schedule.start_ns, schedule.period_ns, False)
-    taken = take_common(tables, stream, table, queued_ns, 0, data.row_of, senders, now)
+    taken = take_common(tables, stream, table, queued_ns, 0, data.row_of, now)
     if taken < table.shape[1]:
         return NOT_TAKEN, taken, nothing, nothing, nothing
     for place in range(tables.news_count[0]):
         if tables.news[place].kind != ANSWER:
             return NOT_DONE, taken, nothing, nothing, nothing
     if schedule.now_ns >= schedule.next_tick_ns:
-        if schedule.now_ns > schedule.next_tick_ns or not _is_calm(data):
+        if not _is_calm(data):
             return NOT_DONE, taken, nothing, nothing, nothing
         answers = _answered(tables, nothing)
-        set_points, judged = _tick(data, rows)
-        return (WITH_TICK if judged else NOT_JUDGED), taken, answers, set_points, nothing
+        return WITH_TICK, taken, answers, _command(data), nothing
     answers = _answered(tables, nothing)
     heartbeats = requests = nothing
     links = tables.links
@@ -251,15 +253,15 @@ def fast_set_points(data: FastPathData) -> tuple[bool, Sending]:
     """Make the set-points of the tick due now. If it needs Python, nothing is done and False is returned."""
     if not _is_calm(data):
         return False, data.scratch.nothing
-    set_points, _ = _command(data)
-    return True, set_points
+    return True, _command(data)
 
 
 @array_kernel
-def _command(data: FastPathData) -> tuple[Sending, NDArray[np.bool_]]:
-    """The set-points of the tick due now, and which vehicles follow the control law."""
+def _command(data: FastPathData) -> Sending:
+    """The set-points of the tick due now."""
     schedule, limits, tables, law = data.schedule[0], data.limits, data.tables, data.law
     controls, points, due_ns = data.scratch.controls, data.scratch.points, schedule.next_tick_ns
+    schedule.tick, schedule.due_ns, schedule.time_s = schedule.tick_count, due_ns, _time_s(data)
     ticks = 1 + (schedule.now_ns - due_ns) // schedule.period_ns  # missed ticks are skipped
     schedule.next_tick_ns = due_ns + ticks * schedule.period_ns
     schedule.tick_count += ticks
@@ -269,6 +271,8 @@ def _command(data: FastPathData) -> tuple[Sending, NDArray[np.bool_]]:
     control_all(controls, law, times_ns, states, seen, data.blends, north_m_s, east_m_s, 1.0)
     shorten(controls.command_m_s2, limits.acceleration_m_s2)
     followed = commanded(controls, data.watched.states.released, data.coming[0].flying)
+    for row in range(len(followed)):
+        data.scratch.followed[row] = followed[row]
     accelerations(points, controls, followed)
     shorten(points.acceleration_ne_m_s2, limits.acceleration_m_s2)
     to = heard(tables.links, points.sent)
@@ -276,7 +280,7 @@ def _command(data: FastPathData) -> tuple[Sending, NDArray[np.bool_]]:
     rtt_s = take_fresh(tables.fresh_ns, tables.fresh_counts)
     for row in range(len(rtt_s)):
         data.scratch.rtt_s[row] = rtt_s[row]
-    return Sending(frames, np.full(len(to), frames.shape[1]), to), followed
+    return Sending(frames, np.full(len(to), frames.shape[1]), to)
 
 
 @kernel
@@ -286,34 +290,34 @@ def _key_ms(schedule: Record, due_ns: int) -> int:
 
 
 @array_kernel
-def _tick(data: FastPathData, rows: Records) -> tuple[Sending, bool]:
-    """Do the tick due now. Returns its set-points, and False if `rows` are not filled: the formation may be broken."""
+def fast_rows(data: FastPathData, sent_ns: Ints, rows: Records) -> bool:
+    """Fill in the rows of the tick just done, whose set-points were sent at `sent_ns`.
+
+    Does nothing and returns False if the formation may be broken.
+    """
     schedule, limits, tables, controls = data.schedule[0], data.limits, data.tables, data.scratch.controls
-    due_ns, number, time_s = schedule.next_tick_ns, schedule.tick_count, _time_s(data)
-    set_points, followed = _command(data)
-    repeated = repeated_s(data.repeated_ns, limits.repetition_ns, controls.used_ns, due_ns)
+    repeated = repeated_s(data.repeated_ns, limits.repetition_ns, controls.used_ns, schedule.due_ns)
     down_m = np.empty(len(controls) if limits.has_slots else 0)
     for row in range(len(down_m)):
         down_m[row] = tables.reported[row].down_m
-    near_m, _ = nearest(controls, due_ns, down_m)
+    near_m, _ = nearest(controls, schedule.due_ns, down_m)
     closest_m = inf
     for row in range(len(near_m)):
         closest_m = closest_m if isnan(near_m[row]) else min(closest_m, near_m[row])
     if data.coming[0].flying and (
         closest_m < limits.collision_m or any_beyond(controls.spacing_error_m, limits.spacing_m)
     ):
-        return set_points, False
+        return False
     states = data.watched.states
     judged = Judged(
-        data.system_ids, states.mode, states.gain_set, controls, tables.reported, data.scratch.rtt_s, followed,
-        data.shorter_s, data.watched.margins_s, repeated,
+        data.system_ids, states.mode, states.gain_set, controls, tables.reported, data.scratch.rtt_s,
+        data.scratch.followed, data.shorter_s, data.watched.margins_s, repeated,
     )  # fmt: skip
-    sent_ns = np.full(len(controls), due_ns)
     fill(
         rows, data.used_s, tables.links, tables.clocks, tables.counters, judged, near_m, sent_ns,
-        number, time_s, due_ns, _key_ms(schedule, due_ns),
+        schedule.tick, schedule.time_s, schedule.due_ns, _key_ms(schedule, schedule.due_ns),
     )  # fmt: skip
-    return set_points, True
+    return True
 
 
 @array_kernel

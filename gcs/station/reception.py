@@ -19,7 +19,7 @@ from gcs.control.history import StateHistory, add_report
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.link import mavlink
 from gcs.link.clocks import MOST_PENDING, UNKNOWN, bound_at_ns, estimate_of, reply, request, sampled_ns
-from gcs.link.datagram import Address, Arrivals, Datagram, Frames, Outbox, arrivals_of
+from gcs.link.datagram import NETWORK_BIT, Arrivals, Datagram, Frames, Outbox, arrivals_of, network_at
 from gcs.link.mavlink import (
     HEARTBEAT,
     LOCAL_POSITION_NED,
@@ -37,8 +37,6 @@ AUTOPILOT_COMPONENT = 1
 """Component id of the autopilot. A camera, gimbal or companion has the vehicle's system id and sends its own
 heartbeats, perhaps from another port: they show neither where the autopilot is nor that it is alive."""
 ANOTHER_ADDRESS = "known system id from another address"
-_NOT_KNOWN = -2
-"""Stands for the number of an address from which no vehicle sends."""
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 REPORTED = np.dtype(
     [
@@ -123,8 +121,6 @@ class Reception:
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
             self.row_of[network_of(system_id), wire_id(system_id)] = row
-        self._senders: tuple[int, Sequence[Address], NDArray[np.int64]] = 0, (), np.empty((2, 0), np.int64)
-        """The last result of `numbered`, with the number of addresses known then and its argument."""
         self._news_of(1)
 
     def _news_of(self, datagrams: int) -> None:
@@ -138,7 +134,7 @@ class Reception:
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
         """Whether this system id, as on the wire, belongs to a vehicle that is known to send from another address."""
-        row = self._row.get(system_id_of(datagram.address[2], system_id))
+        row = self._row.get(system_id_of(network_at(datagram.address), system_id))
         return row is not None and self._fleet.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
     def take(self, datagrams: Arrivals | Sequence[Datagram], now_ns: int, taken: int = 0) -> Outbox:
@@ -155,9 +151,8 @@ class Reception:
             self._news_of(count)
         now = Now(now_ns, self._start_ns, self._period_ns, self._fleet.loop.heeds_deliveries)
         while place < count:
-            senders = self.numbered(arrivals.addresses)
             stop = take_common(
-                self.tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self.row_of, senders, now
+                self.tables, arrivals.stream, arrivals.table, arrivals.queued_ns, place, self.row_of, now
             )
             if stop > place:
                 self.frames.add(arrivals, place, stop)
@@ -167,25 +162,11 @@ class Reception:
             place = stop + 1
         return outgoing
 
-    def numbered(self, addresses: Sequence[Address]) -> NDArray[np.int64]:
-        """The network of each address, and its number among the vehicles' addresses, shape (2, m)."""
-        numbers = self._fleet.links.addresses
-        known, of, senders = self._senders
-        if of is not addresses or senders.shape[1] != len(addresses):
-            own = [[network for _, _, network in addresses], [numbers.get(one, _NOT_KNOWN) for one in addresses]]
-            senders = np.array(own, np.int64).reshape(2, -1)
-        else:
-            for address in [*numbers][known:]:
-                if address in addresses:
-                    senders[1, addresses.index(address)] = numbers[address]
-        self._senders = len(numbers), addresses, senders
-        return senders
-
     def _take(self, datagram: Datagram, now: Now, outgoing: Outbox) -> None:
         """Process one datagram with any content."""
         is_1 = datagram.data[:1] == b"\xfe"
         frames = mavlink.decode_either(datagram.data, self.counters)
-        for frame in mavlink.in_network(frames, datagram.address[2]):
+        for frame in mavlink.in_network(frames, network_at(datagram.address)):
             row = self._row.get(frame.system_id)
             if row is None:
                 self.counters["unknown system id"] += 1
@@ -306,19 +287,19 @@ def take_fresh(fresh_ns: Array, counts: Array) -> FloatArray:
 
 @kernel
 def take_common(
-    tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, senders: Array, now: Now
+    tables: Tables, stream: Array, table: Array, queued_ns: Array, first: int, row_of: Array, now: Now
 ) -> int:
     """Process datagrams from `first` on; returns the index of the first that needs Python, else their number.
 
-    Stream, table and `queued_ns` are those of `Arrivals`, and `senders` is what `Reception.numbered` returns.
+    Stream, table and `queued_ns` are those of `Arrivals`.
     """
     for place in range(first, table.shape[1]):
-        begin, end, sender, received_ns = table[0, place], table[1, place], table[2, place], table[3, place]
+        begin, end, address, received_ns = table[0, place], table[1, place], table[2, place], table[3, place]
         msg_id = common_message(stream, begin, end)
         if msg_id < 0 or stream[begin + 6] != AUTOPILOT_COMPONENT:
             return place
-        row = row_of[senders[0, sender], stream[begin + 5]]
-        if row < 0 or tables.links[row].address != senders[1, sender]:
+        row = row_of[address >> NETWORK_BIT, stream[begin + 5]]
+        if row < 0 or tables.links[row].address != address:
             return place
         if not _take_frame(tables, row, msg_id, stream, begin, end, received_ns, queued_ns[place], now):
             return place

@@ -89,17 +89,17 @@ class Station:
         self._fleet = fleet_of(plan, journal.report, own, strangers=strangers)
         self.vehicles, self.together_ns = self._fleet.vehicles, self._fleet.together_ns
         n = len(self.vehicles)
-        self._period_ns = round(NS_PER_S / rates.control_hz)
-        self._reception = Reception(self._fleet, journal.report, start_ns=start_ns, period_ns=self._period_ns)
+        self.period_ns = round(NS_PER_S / rates.control_hz)
+        self._reception = Reception(self._fleet, journal.report, start_ns=start_ns, period_ns=self.period_ns)
         self._history = self._reception.history
         self.frames, self.counters = self._reception.frames, self._reception.counters
-        self.is_another, self.senders = self._reception.is_another, self._reception.numbered
+        self.is_another = self._reception.is_another
         """See `Reception`."""
         self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
         self._limits = limits_of(plan)
         self._speed_max_m_s = scenario.limits.speed_max_m_s or LARGEST_COMMAND_M_S2
-        period_s, timesync_ns = self._period_ns / NS_PER_S, round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
+        period_s, timesync_ns = self.period_ns / NS_PER_S, round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._monitor = FormationMonitor(
             n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
@@ -110,9 +110,9 @@ class Station:
         # sent together.
         for name, value in {
             "now_ns": start_ns, "start_ns": start_ns, "next_tick_ns": start_ns, "next_heartbeat_ns": start_ns,
-            "next_timesync_ns": start_ns + self._period_ns // 2, "next_requests_ns": start_ns + self._period_ns // 2,
-            "period_ns": self._period_ns, "timesync_spacing_ns": max(1, timesync_ns // n),
-            "requests_apart_ns": min(self._period_ns // 3, _REQUESTS_APART_NS),
+            "next_timesync_ns": start_ns + self.period_ns // 2, "next_requests_ns": start_ns + self.period_ns // 2,
+            "period_ns": self.period_ns, "timesync_spacing_ns": max(1, timesync_ns // n),
+            "requests_apart_ns": min(self.period_ns // 3, _REQUESTS_APART_NS),
         }.items():  # fmt: skip
             self._schedule[name] = value
         self._used_s, self._repeated_ns = np.full(n, nan), np.zeros((2, n), np.int64)
@@ -231,17 +231,17 @@ class Station:
         """The row of a vehicle that only `awaits_clock`; -1 if there is none."""
         return next((row for row, vehicle in enumerate(self.vehicles) if vehicle.awaits_clock), -1)
 
-    def unjudged(self, due_ns: int, indices: IntArray) -> Tick:
-        """A tick whose set-points kernels have made; the arguments are fields of `Tick`."""
+    def unjudged(self, indices: IntArray) -> Tick:
+        """The last tick whose set-points kernels have made; for `indices` see `Tick`."""
         self._journal.now_ns = self._columns["now_ns"][0]
-        number = (due_ns - self._start_ns) // self._period_ns
-        return Tick(number, self.scenario_time_s(due_ns), due_ns, self._key_ms(due_ns), None, indices)
+        due_ns = self._columns["due_ns"][0]
+        time_s, key_ms = self.scenario_time_s(due_ns), self._key_ms(due_ns)
+        return Tick(self._columns["tick"][0], time_s, due_ns, key_ms, None, indices)
 
     def _judged_by_kernels(self, due_ns: int) -> Judged:
         """The results behind set-points that kernels have made."""
-        controls, rtt_s = self._scratch.controls, self._scratch.rtt_s
-        followed = commanded(controls, self._monitor.released, True)
-        return self._judged(controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
+        _, _, rtt_s, _, followed, _ = scratch = self._scratch
+        return self._judged(scratch.controls, rtt_s, followed, self._tolerated or self._tolerances(rtt_s), due_ns)
 
     def _key_ms(self, due_ns: int) -> int:
         """The `time_boot_ms` of the set-points of a tick."""
@@ -307,19 +307,18 @@ class Station:
 
     def _fast_tick(self, outgoing: Outbox) -> Tick | None:
         """Do the tick due now with a kernel if possible, else return None."""
-        due_ns = self.next_tick_ns
         if self.phase is not Phase.FLYING or not self.has_fast_path or not self.look_ahead():
             return None
         done, set_points = fast_set_points(self.fast_path_data)
         if not done:
             return None
         indices = self._add_set_points(Block(*set_points, self._fleet.links.to), outgoing)
-        return self.unjudged(due_ns, indices)
+        return self.unjudged(indices)
 
     def _tick(self, outgoing: Outbox) -> Tick:
         due_ns = self.next_tick_ns
-        behind = (self._journal.now_ns - due_ns) // self._period_ns
-        self.next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
+        behind = (self._journal.now_ns - due_ns) // self.period_ns
+        self.next_tick_ns = due_ns + (behind + 1) * self.period_ns  # missed ticks are skipped
         self._decide(due_ns, outgoing)
         self._fleet.locate(self._history)
         flying = self.phase is Phase.FLYING

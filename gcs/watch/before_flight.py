@@ -10,12 +10,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from gcs.control.phases import patience_s
-from gcs.drive.lockstep import START_NS, Sent, vehicles_of
+from gcs.drive.lockstep import START_NS, Sent, vehicles_of, virtual_address
 from gcs.drive.sitl import VehicleProcess
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.link import mavlink
+from gcs.link.datagram import NUMBER_BITS
 from gcs.plan.design import LinkPart
 from gcs.runs.files import write_scenario
 from gcs.runs.record import SCENARIO_FILE
@@ -103,9 +104,8 @@ def _watch_virtually(found: _Measurement, scenario: Scenario) -> None:
     to_vehicles: Sent = []
     while not found.is_long_enough(now_ns) and now_ns - START_NS < found.patience_s * NS_PER_S:
         for system_id, data, time_ns in vehicles.step(to_vehicles, now_ns):
-            network = network_of(system_id)
-            for frame in mavlink.in_network(mavlink.decode(data, found.watch.counters), network):
-                if found.watch.take(frame, time_ns, ("virtual", system_id, network)) is not None:
+            for frame in mavlink.in_network(mavlink.decode(data, found.watch.counters), network_of(system_id)):
+                if found.watch.take(frame, time_ns, virtual_address(system_id)) is not None:
                     found.recorder.note(frame, time_ns)
-        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id, _) in requests.due(found.watch, now_ns)]
+        to_vehicles = [(address & NUMBER_BITS, data, now_ns) for data, address in requests.due(found.watch, now_ns)]
         now_ns = requests.next_ns

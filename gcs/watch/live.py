@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
+from gcs.link.datagram import network_at
 from gcs.views.console import draw, live_display
 from gcs.watch.links import Requests, Watch, WatchReport, prepare
 from gcs.watch.saved_links import LinkRecorder
@@ -72,7 +73,7 @@ def watch_links(
             link.wait(min(look_ns, end_ns, requests.next_ns))  # short waits, because a signal does not end one
             for datagram in link.receive(watch.counters):
                 frames = mavlink.decode_either(datagram.data, watch.counters)
-                for frame in mavlink.in_network(frames, datagram.address[2]):
+                for frame in mavlink.in_network(frames, network_at(datagram.address)):
                     taken = watch.take(frame, datagram.received_ns, datagram.address)
                     if recorder is not None and taken is not None:
                         recorder.note(frame, datagram.received_ns)

@@ -11,7 +11,7 @@ from gcs.cli.main import main
 from gcs.drive.flown import fly_plan
 from gcs.drive.lockstep import START_NS, fly_lockstep, signed_ends
 from gcs.errors import InputError
-from gcs.link.datagram import Datagram
+from gcs.link.datagram import Datagram, address_at
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.record import tlog_file
@@ -82,9 +82,13 @@ def test_a_signed_flight_in_networks_is_the_unsigned_one() -> None:
 def test_a_vehicle_is_heard_in_its_own_network_only() -> None:
     station = Station(planned(renumbered(2.0)), start_ns=START_NS)
     for network in (0, 1, 2, 9):
-        station.step([Datagram(HEARTBEAT, ("127.0.0.1", 7000 + network, network), START_NS)], START_NS)
+        station.step([Datagram(HEARTBEAT, address_at("127.0.0.1", 7000 + network, network), START_NS)], START_NS)
     heard = {vehicle.system_id: vehicle.address for vehicle in station.vehicles if vehicle.address is not None}
-    assert heard == {2: ("127.0.0.1", 7000, 0), 1002: ("127.0.0.1", 7001, 1), 9002: ("127.0.0.1", 7009, 9)}
+    assert heard == {
+        2: address_at("127.0.0.1", 7000, 0),
+        1002: address_at("127.0.0.1", 7001, 1),
+        9002: address_at("127.0.0.1", 7009, 9),
+    }
     assert station.counters == {"unknown system id": 1}
 
 

@@ -38,7 +38,7 @@ def hostile(rng: np.random.Generator, messages: list[int], source: int) -> list[
 @pytest.mark.parametrize("commands", [False, True])
 def test_a_mirror_under_fire_counts_and_goes_on(other: socket.socket, commands: bool) -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
-    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9, 0), True, vehicle.kind.guided_mode
+    vehicle.address, vehicle.armed, vehicle.custom_mode = 9, True, vehicle.kind.guided_mode
     rng = np.random.default_rng(4)
     with Mirror(*other.getsockname(), commands=commands) as mirror:
         mirror.forward([b"hello"], 0)

@@ -166,7 +166,7 @@ def test_mavsdk_on_a_mirror_finds_every_vehicle_and_its_position(tmp_path: Path)
 
 def test_nothing_garbled_or_in_a_vehicles_name_is_passed_on() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
-    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9, 0), True, vehicle.kind.guided_mode
+    vehicle.address, vehicle.armed, vehicle.custom_mode = 9, True, vehicle.kind.guided_mode
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
@@ -182,7 +182,7 @@ def test_nothing_garbled_or_in_a_vehicles_name_is_passed_on() -> None:
                 other.sendto(data, address)
             stranger.sendto(good, address)  # the socket is connected: this never gets in
             passed = mirror.passed_on([vehicle], 0)
-    assert passed == [(good, ("127.0.0.1", 9, 0))]
+    assert passed == [(good, 9)]
     assert mirror.counters["passed on COMMAND_LONG"] == 1
     assert mirror.counters["refused COMMAND_LONG of or for a system that is not flown"] == 1
     assert mirror.counters["refused HEARTBEAT of or for a system that is not flown"] == 1
@@ -191,7 +191,7 @@ def test_nothing_garbled_or_in_a_vehicles_name_is_passed_on() -> None:
 
 def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
-    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9, 0), True, vehicle.kind.guided_mode
+    vehicle.address, vehicle.armed, vehicle.custom_mode = 9, True, vehicle.kind.guided_mode
     mav = dialect.MAVLink(None, srcSystem=255)
     stream, long = dialect.MAVLink_request_data_stream_message, dialect.MAVLink_command_long_message
     whole = dialect.MAVLink_command_int_message(1, 1, 0, 511, 0, 0, 32, 250_000, 0, 0, 0, 0, 0)
@@ -217,7 +217,7 @@ def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
 
 def test_a_vehicle_that_left_guided_flight_is_not_cut_off() -> None:
     vehicle = RemoteVehicle(1, startup=AutopilotStartup(altitude_m=5.0, telemetry_hz=20.0))
-    vehicle.address, guided, loiter = ("127.0.0.1", 9, 0), ARDUCOPTER.guided_mode, 5
+    vehicle.address, guided, loiter = 9, ARDUCOPTER.guided_mode, 5
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         with Mirror(*other.getsockname(), commands=True) as mirror:
@@ -232,7 +232,7 @@ def test_a_vehicle_that_left_guided_flight_is_not_cut_off() -> None:
 
 def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
-    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9, 0), True, vehicle.kind.guided_mode
+    vehicle.address, vehicle.armed, vehicle.custom_mode = 9, True, vehicle.kind.guided_mode
     ours, theirs = Guard(Key(KEY), epoch_ns=EPOCH_NS, stamps=Stamps()), a_sender(system=255)
     good = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(1, target_system=1), sequence=0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
@@ -248,7 +248,7 @@ def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
             for sent in (good, signed, signed):
                 other.sendto(sent, address)
             passed = mirror.passed_on([vehicle], NOW_NS)
-    assert passed == [(good, ("127.0.0.1", 9, 0))]  # as a frame that the link to the vehicle signs
+    assert passed == [(good, 9)]  # as a frame that the link to the vehicle signs
     assert mirror.counters == {
         "forwarded": 1,
         "refused: unsigned": 1,

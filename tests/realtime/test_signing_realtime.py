@@ -17,13 +17,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.drive.guard import Guard
-from gcs.drive.udp import StationSocket, clock_ns, realtime_offset_ns
+from gcs.drive.udp import StationSocket, clock_ns
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
 from scenarios.signing.stamps import Stamps, open_stamps
+from scenarios.sockets import realtime_offset_ns
 from tests.support.paths import SCENARIOS
 from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, gcs, short, until
 from tests.support.signed_peer import KEY, OTHER_KEY, position

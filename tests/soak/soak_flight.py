@@ -127,7 +127,7 @@ class World:
             return []
         ids = [*self.fleet.system_ids, *range(1, 256)]
         frames = any_message(self._rng, GARBAGE_A_STEP, ids, {_HEARTBEAT}) + noise(self._rng, GARBAGE_A_STEP)
-        return [Datagram(data, ("stranger", 9, 0), now_ns) for data in frames]
+        return [Datagram(data, 1_000_009, now_ns) for data in frames]
 
     def _under_fire(self, now_ns: int) -> tuple[int, ...]:
         if not self.flying or len(self._up) < 20 or len(self._down) < 20:

@@ -5,9 +5,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.link.datagram import Address, Datagram, Outgoing
+from gcs.link.datagram import Address, Datagram, Outgoing, address_at
 
-HOME = ("127.0.0.1", 5001, 0)
+HOME = address_at("127.0.0.1", 5001)
 
 
 class Peer:

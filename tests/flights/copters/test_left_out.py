@@ -132,7 +132,7 @@ def test_copters_stop_in_flight_and_fly_on() -> None:
 
 def test_patience_does_not_count_what_waited_in_the_socket_before_the_start() -> None:
     station = Station(plan_for(lacking(3, patience_s=8.0)), start_ns=START_NS)
-    peers = [Peer(k, ("127.0.0.1", 5000 + k, 0)) for k in (1, 2, 3)]
+    peers = [Peer(k, 5000 + k) for k in (1, 2, 3)]
     waited = [peer.heartbeat(START_NS - before_ns) for before_ns in (30_000_000_000, 1_000_000) for peer in peers]
     for step in range(10):
         station.step(waited if step == 0 else [], station.next_event_ns)

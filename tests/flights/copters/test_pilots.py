@@ -100,7 +100,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
             break
     vehicle = station.vehicles[2]
     assert vehicle.taken_over
-    vehicle.address = ("elsewhere", 3, 0)
+    vehicle.address = 1_000_003
     vehicle.begin_anew()
     told = [vehicle.next_frame(station.next_event_ns + k * SECOND // 50) for k in range(500)]
     numbers = {parse(frame).command for frame in told if frame is not None}
@@ -186,7 +186,7 @@ def test_an_abandoned_flight_leaves_its_vehicles_holding(flavour: str) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     station, pilots = fly(flown(flavour), flavour, {began_s + 2.0: mode}, until_s=began_s + 5.0)
     now_ns = station.next_event_ns
-    pilots.step([(address[1], frame, now_ns) for frame, address in station.abandoned()], now_ns)
+    pilots.step([(address, frame, now_ns) for frame, address in station.abandoned()], now_ns)
     pilots.step([], now_ns + SECOND)
     modes = {system_id: pilots.fleet.vehicle(system_id).craft.mode for system_id in (1, 2, 3)}  # pyright: ignore[reportAttributeAccessIssue]
     assert modes == {1: RULES[flavour].hold_mode, 2: RULES[flavour].hold_mode, 3: mode}
@@ -209,7 +209,7 @@ def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
 
 def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     vehicle = RemoteVehicle(3, startup=LaunchedStartup(50.0))
-    vehicle.address = ("127.0.0.1", 3, 0)
+    vehicle.address = 3
 
     def heartbeat(mode: int, *, armed: bool, at_s: float) -> tuple[int, bool]:
         vehicle.heartbeat((mode, 2, 3, 0x80 if armed else 0, 4, 3), round(at_s * SECOND))

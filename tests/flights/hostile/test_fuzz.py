@@ -93,10 +93,10 @@ class Fire:
         own += any_message(rng, tenth, [k for k in range(1, 256) if self.signed or k not in ids], set())
         if self.signed:
             own += extreme(rng, tenth, SAID_BY_VEHICLES, source=ids[0], targets=[0, 255])
-        fired = [Datagram(bytes(data), ("stranger", 9, 0), now_ns) for data in stranger]
-        fired += [Datagram(data, ("virtual", ids[k % 3], 0), now_ns) for k, data in enumerate(own)]
+        fired = [Datagram(bytes(data), 1_000_009, now_ns) for data in stranger]
+        fired += [Datagram(data, ids[k % 3], now_ns) for k, data in enumerate(own)]
         replays = [self.up[k] for k in rng.integers(len(self.up), size=tenth).tolist()]
-        fired += [Datagram(data, ("virtual", system_id, 0), now_ns) for system_id, data in replays]
+        fired += [Datagram(data, system_id, now_ns) for system_id, data in replays]
         self.fired["station"] += len(fired)
         return fired
 
@@ -128,7 +128,7 @@ def flown(plan: FlightPlan, fire: Fire | None, key: Key | None) -> tuple[TickArr
     while station.phase is not Phase.ENDED:
         now_ns = station.next_event_ns
         arrived = fleet.step(down, now_ns)
-        datagrams = [Datagram(data, ("virtual", system_id, 0), time_ns) for system_id, data, time_ns in arrived]
+        datagrams = [Datagram(data, system_id, time_ns) for system_id, data, time_ns in arrived]
         if fire is not None:
             fire.up.extend((system_id, data) for system_id, data, _ in arrived)
             datagrams += fire.at_station(now_ns)
@@ -137,7 +137,7 @@ def flown(plan: FlightPlan, fire: Fire | None, key: Key | None) -> tuple[TickArr
         outgoing, tick = station.step(datagrams, now_ns)
         if guard is not None:
             outgoing = guard.sent(outgoing, now_ns)
-        down = [(int(address[1]), data, now_ns) for data, address in outgoing]
+        down = [(address, data, now_ns) for data, address in outgoing]
         if fire is not None:
             fire.down.extend((system_id, data) for system_id, data, _ in down)
             down += fire.at_vehicles(now_ns)
@@ -204,7 +204,7 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
     asked: dict[int, int] = {}
     for _ in range(900):
         now_ns = station.next_event_ns
-        datagrams = [Datagram(data, ("virtual", own, 0), time_ns) for own, data, time_ns in fleet.step(down, now_ns)]
+        datagrams = [Datagram(data, own, time_ns) for own, data, time_ns in fleet.step(down, now_ns)]
         if now_ns >= START_NS + from_second * 10**9:
             for own in ids:
                 frames = extreme(rng, 2, SAID_BY_VEHICLES, source=own, targets=[0, 255, own])
@@ -212,14 +212,14 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
                     tc1_ns = int(rng.choice([-(2**63), -1, 1, 2**62 - 1, 2**63 - 1]))
                     frames.insert(0, timesync_reply(tc1_ns, asked.pop(own), own, 200))
                 frames += [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]
-                datagrams += [Datagram(frame, ("virtual", own, 0), now_ns) for frame in frames]
+                datagrams += [Datagram(frame, own, now_ns) for frame in frames]
         outgoing, tick = station.step(datagrams, now_ns)
         if tick is not None:
             rows = station.complete(tick, [now_ns] * len(outgoing))
             station.frames.clear()
             commands = np.hypot(rows["command_north_m_s2"], rows["command_east_m_s2"])[rows["commanded"]]
             assert np.isfinite(commands).all()
-        down = [(int(address[1]), data, now_ns) for data, address in outgoing]
+        down = [(address, data, now_ns) for data, address in outgoing]
         for own, data, _ in down:
             for frame in mavlink.decode(data, Counter()):
                 if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
@@ -249,7 +249,7 @@ def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version:
             frames = [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]
         for data in (*frames, *changed(rng, 8, frames), *noise(rng, 8)):
             for frame in mavlink.decode_either(data, watch.counters):
-                watch.take(frame, now_ns, ("127.0.0.1", 9 + step % 3, 0))
+                watch.take(frame, now_ns, 9 + step % 3)
         watch.look(now_ns)
     for figures in watch.figures(now_ns, Design(delay_margin_s=0.3)):
         figures.to_json()

@@ -179,7 +179,7 @@ def test_a_restarted_station_refuses_what_was_recorded_before() -> None:
     memory = Stamps()
     attacked = Attacked(a_fleet(plan))
     flown(plan, attacked, a_guard(stamps=memory))
-    recorded = [Datagram(data, ("virtual", system_id, 0), START_NS) for system_id, data in attacked.up]
+    recorded = [Datagram(data, system_id, START_NS) for system_id, data in attacked.up]
     refused: Counter[str] = Counter()
     again = a_guard(stamps=Stamps(memory.memory))
     assert again.received(recorded, START_NS + 10**9, refused) == []
@@ -196,13 +196,13 @@ def test_an_earlier_copy_from_elsewhere_makes_no_frame_a_replay() -> None:
     copies = 0
     while station.phase is not Phase.ENDED:
         now_ns = station.next_event_ns
-        arrived = [Datagram(data, ("virtual", k, 0), at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
-        first = [Datagram(d.data, ("stranger", 7, 0), d.received_ns) for d in arrived] if now_ns > 2 * 10**9 else []
+        arrived = [Datagram(data, k, at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
+        first = [Datagram(d.data, 1_000_009, d.received_ns) for d in arrived] if now_ns > 2 * 10**9 else []
         copies += len(first)
         outgoing, tick = station.step(
             guard.received(first + arrived, now_ns, station.counters, station.is_another), now_ns
         )
-        down = [(int(address[1]), data, now_ns) for data, address in guard.sent(outgoing, now_ns)]
+        down = [(address, data, now_ns) for data, address in guard.sent(outgoing, now_ns)]
         if tick is not None:
             ticks.append(station.complete(tick, [now_ns] * len(outgoing)))
     for name in calm.dtype.names or ():
@@ -216,10 +216,10 @@ def test_a_mavlink_1_heartbeat_is_an_exception_only_without_signing() -> None:
     heartbeat = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(
         a_sender(key=None, system=scenario.vehicles[0].system_id), force_mavlink1=True
     )
-    datagram = [Datagram(heartbeat, ("127.0.0.1", 9, 0), START_NS)]
+    datagram = [Datagram(heartbeat, 9, START_NS)]
     open_station, guarded = Station(plan, start_ns=START_NS), Station(plan, start_ns=START_NS)
     open_station.step(datagram, START_NS)
-    assert open_station.vehicles[0].address == ("127.0.0.1", 9, 0)
+    assert open_station.vehicles[0].address == 9
     guarded.step(a_guard().received(datagram, START_NS, guarded.counters), START_NS)
     assert guarded.vehicles[0].address is None
     assert guarded.counters == {"MAVLink 1": 1}
@@ -231,10 +231,10 @@ def test_what_is_logged_of_a_signed_flight_has_no_signatures() -> None:
     down: Sent = []
     for _ in range(40):
         now_ns = station.next_event_ns
-        arrived = [Datagram(data, ("virtual", k, 0), at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
+        arrived = [Datagram(data, k, at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
         outgoing, _ = station.step(guard.received(arrived, now_ns, station.counters, station.is_another), now_ns)
         signed = guard.sent(outgoing, now_ns)
         assert all(stamp(data) > 0 and data[2] == 1 for data, _ in signed)
-        down = [(int(address[1]), data, now_ns) for data, address in signed]
+        down = [(address, data, now_ns) for data, address in signed]
     assert len([*station.frames]) > 20
     assert all(data[2] == 0 and len(data) == 12 + data[1] for data, _, _ in station.frames)

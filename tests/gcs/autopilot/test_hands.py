@@ -24,7 +24,7 @@ class Talk:
         self.texts: list[str] = []
         startup = AutopilotStartup(altitude_m=5.0, telemetry_hz=50.0)
         self.vehicle = RemoteVehicle(2, startup=startup, report=lambda _kind, text, _id: self.texts.append(text))
-        self.vehicle.address = "127.0.0.1", 1, 0
+        self.vehicle.address = 1
         self.vehicle.clock.samples = LEAST_SAMPLES
         self.now_ns, self._autopilot = NS_PER_S, autopilot
         self.hear(mavlink.EKF_STATUS_REPORT if autopilot != PX4 else mavlink.ESTIMATOR_STATUS, flags=0x33F)

@@ -21,7 +21,7 @@ def requested(frame: bytes | None) -> float:
 def asked_twice() -> RemoteVehicle:
     """A vehicle that was asked twice for positions, before the first answer came."""
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0, target_hz=10.0))
-    vehicle.address = "127.0.0.1", 1, 0
+    vehicle.address = 1
     vehicle.clock.rtt_ns = 3 * NS_PER_S // 10
     assert requested(vehicle.next_frame(0)) == mavlink.LOCAL_POSITION_NED
     assert requested(vehicle.next_frame(NS_PER_S)) == mavlink.LOCAL_POSITION_NED
@@ -58,7 +58,7 @@ def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
 
 def test_a_vehicle_with_nothing_left_to_command_awaits_answers_to_timesync() -> None:
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
-    vehicle.address, vehicle.heard_ns = ("127.0.0.1", 1, 0), NS_PER_S
+    vehicle.address, vehicle.heard_ns = 1, NS_PER_S
     for command in (SET_MESSAGE_INTERVAL, SET_MODE, ARM_DISARM):
         assert not vehicle.awaits_clock
         assert vehicle.next_frame(NS_PER_S) is not None
@@ -74,7 +74,7 @@ def test_a_vehicle_with_nothing_left_to_command_awaits_answers_to_timesync() -> 
 def stranger() -> tuple[RemoteVehicle, list[int]]:
     """A vehicle that has to say that it is simulated, and the ids of what it is sent in twenty seconds."""
     vehicle, sent = RemoteVehicle(7, startup=LaunchedStartup(50.0, stranger=True)), list[int]()
-    vehicle.address = "127.0.0.1", 1, 0
+    vehicle.address = 1
     for k in range(400):
         vehicle.heard_ns = k * NS_PER_S // 20
         if (frame := vehicle.next_frame(k * NS_PER_S // 20)) is not None:

@@ -43,7 +43,7 @@ def test_the_tick_log_ends_with_its_last_whole_tick(part: int, tmp_path: Path) -
     with disk_full_at(ticks[:20].nbytes + part):
         for rows in ticks[20:40]:
             writer.tick(rows)
-            writer.frames(Frames([(b"frame", 1, ("", 0, 0))]))
+            writer.frames(Frames([(b"frame", 1, 0)]))
     for rows in ticks[40:]:  # there is room again, but a gap would look like ticks that were missed
         writer.tick(rows)
     writer.event(Event(time_s=1.2, kind="end", text="completed: duration reached"))

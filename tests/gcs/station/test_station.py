@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Datagram, Outgoing, address_at
 from gcs.link.startup import WITHOUT_TARGET
 from gcs.link.vehicle import told_by
 from gcs.plan.flight_plan import FlightPlan
@@ -154,7 +154,7 @@ def test_unknown_system_id_is_counted_and_not_answered() -> None:
 
 
 def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
-    station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666, 0))
+    station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, address_at("127.0.0.1", 6666))
     station.step([peer.heartbeat(S)], S)
     station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)
     assert station.vehicles[1].address == HOME
@@ -175,7 +175,7 @@ def test_a_vehicle_that_speaks_mavlink_1_is_named_as_such_until_it_speaks_mavlin
 
 
 def test_a_companion_takes_no_vehicles_place() -> None:
-    station, peer, companion = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666, 0), component=191)
+    station, peer, companion = Station(PLAN, start_ns=S), Peer(2), Peer(2, address_at("127.0.0.1", 6666), component=191)
     vehicle = station.vehicles[1]
     station.step([companion.heartbeat(S)], S)
     assert (vehicle.address, vehicle.first_heard_ns) == (None, None)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from gcs.errors import InputError
 from gcs.link import mavlink
-from gcs.link.datagram import Arrivals, Frames
+from gcs.link.datagram import Arrivals, Frames, address_at
 from gcs.runs.record import TLOG_FILE, RunWriter
 from gcs.watch.tlog import parse_tlog, read_tlog
 from scenarios.sockets import joined
@@ -34,7 +34,7 @@ def found(data: bytes) -> list[tuple[int, bytes]]:
 
 def test_what_a_run_writes_is_read_back_with_its_times(tmp_path: Path) -> None:
     writer = RunWriter(tmp_path)
-    writer.frames(Frames((frame, stamp_us * 1000 + 999, ("", 0, 0)) for stamp_us, frame in ENTRIES))
+    writer.frames(Frames((frame, stamp_us * 1000 + 999, 0) for stamp_us, frame in ENTRIES))
     writer.close()
     log = read_tlog(tmp_path / TLOG_FILE)
     assert [(time_ns, frame.data) for time_ns, frame in log.frames] == [(us * 1000, frame) for us, frame in ENTRIES]
@@ -44,12 +44,12 @@ def test_what_a_run_writes_is_read_back_with_its_times(tmp_path: Path) -> None:
 def test_frames_of_several_networks_are_logged_apart_in_order(tmp_path: Path) -> None:
     stream, ends = joined([frame for _, frame in ENTRIES])
     times_ns = [1000 * us + 999 for us, _ in ENTRIES]
-    table = np.array([ends[:-1], ends[1:], [k % 3 for k in range(len(ENTRIES))], times_ns])
-    addresses = [("a", 1, 0), ("b", 1, 2), ("c", 1, 2)]
+    addresses = [address_at("10.0.0.1", port, network) for port, network in ((1, 0), (1, 2), (2, 2))]
+    table = np.array([ends[:-1], ends[1:], [addresses[k % 3] for k in range(len(ENTRIES))], times_ns])
     frames = Frames()
-    frames.add(Arrivals(stream, table, np.zeros(len(ENTRIES), np.int64), addresses), 0, 40)
+    frames.add(Arrivals(stream, table, np.zeros(len(ENTRIES), np.int64)), 0, 40)
     frames.append((ENTRIES[40][1], times_ns[40] - 7_000_000, addresses[1]))
-    frames.add(Arrivals(stream, table, np.zeros(len(ENTRIES), np.int64), addresses), 41)
+    frames.add(Arrivals(stream, table, np.zeros(len(ENTRIES), np.int64)), 41)
     writer = RunWriter(tmp_path)
     writer.frames(frames, 7_000_000)
     writer.close()

@@ -31,7 +31,6 @@ from tests.support.sim_client import arm, command, guided, heartbeat, setpoint
 START_NS = 1_000_000_000
 MS = 1_000_000
 CHAIN = load(SCENARIOS / "chain3.toml")
-HOST = "virtual"
 
 
 def linked(up: Link, down: Link) -> Scenario:
@@ -73,7 +72,7 @@ class Watched:
                     self.watch.take(frame, time_ns)
             for system_id, data, time_ns in self.fleet.step(to_vehicles, self.now_ns):
                 for frame in mavlink.decode_either(data, self.watch.counters):
-                    self.watch.take(frame, time_ns, (HOST, system_id, 0))
+                    self.watch.take(frame, time_ns, system_id)
             looks = len(self.true_ages_s)
             self.watch.look(self.now_ns)
             if 1 in self.watch.vehicles and len(self.watch.vehicles[1].age_s) > looks:
@@ -82,7 +81,7 @@ class Watched:
             self.sent += [data for data, _ in outgoing]
             sent_ns = self.now_ns + self._late_ns
             self.watch.sent(Datagram(data, address, sent_ns) for data, address in outgoing)
-            to_vehicles = [(system_id, data, sent_ns) for data, (_, system_id, _) in outgoing]
+            to_vehicles = [(system_id, data, sent_ns) for data, system_id in outgoing]
 
     def _true_age_s(self) -> float:
         boot_ms = self.watch.vehicles[1].boot_ns // MS
@@ -94,7 +93,7 @@ class Peer:
     """A vehicle that says what a test wants."""
 
     def __init__(self, system_id: int, port: int = 1) -> None:
-        self._system_id, self._address, self._sequence = system_id, (HOST, port, 0), 0
+        self._system_id, self._address, self._sequence = system_id, port, 0
 
     def say(
         self, watch: Watch, msg_id: int, fields: tuple[object, ...], time_ns: int, *, component_id: int = 1
