@@ -93,7 +93,7 @@ def test_the_links_table_stands_until_ctrl_c_restores_the_shell(tmp_path: Path) 
             wait_for(lambda: len(rows(shown, measured)) == 3, shown)
             for row in rows(shown, measured).values():
                 assert float(row[1]) == pytest.approx(40, abs=4)
-                assert 0 < int(row[5]) < 100
+                assert 0 < int(row[6]) < 100
             shown.send("\x03")
             assert is_restored(shown)
             assert any("requests, nothing else" in line for line in shown.lines())
