@@ -9,6 +9,6 @@ from gcs import fly_virtual
 from scenarios.files import load
 from scenarios.shipped import FOLDER
 
-for name in ("gcs.cli.main", "gcs.drive.check", "gcs.drive.fly", "gcs.views.flight_report"):
+for name in ("gcs.cli.main", "gcs.preflight.check", "gcs.drive.fly", "gcs.views.flight_report"):
     import_module(name)
 fly_virtual(load(FOLDER / "chain3.toml").model_copy(update={"duration_s": 1.0}))

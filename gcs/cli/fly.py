@@ -75,9 +75,9 @@ def fly(
     or lands, or an assertion does not hold.
     """
     from gcs.drive import fly as flying
-    from gcs.drive import preflight
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan, with_trade_off
+    from gcs.preflight import faults
     from gcs.views.flight_report import leave_report
     from gcs.views.report import print_design, print_summary
     from gcs.views.viewer import new_viewer, viewer_url
@@ -93,8 +93,8 @@ def fly(
         scenario_file, loop, without, links=links, link_delay_s=link_delay, allow_code=allow_code
     )
     if connect is None:
-        options.refuse(scenario_file, preflight.bad_start(scenario))
-        options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
+        options.refuse(scenario_file, faults.bad_start(scenario))
+        options.refuse(scenario_file, faults.endless_link(scenario), in_file=link_delay is None and links is None)
     with contextlib.ExitStack() as opened:
         link = to = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)

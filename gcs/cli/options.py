@@ -167,13 +167,13 @@ def flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable:
 
     An unstable loop is refused, or only warned about if `allow_unstable`; its monitor then only watches.
     """
-    from gcs.drive import preflight
     from gcs.plan import planner
+    from gcs.preflight import faults
     from gcs.views.console import ms_text
 
-    if (unstable := preflight.unstable_loop(plan)) is not None:
+    if (unstable := faults.unstable_loop(plan)) is not None:
         refuse_or_warn(file, unstable, allow=allow_unstable)
-        return design, preflight.without_actions(plan)
+        return design, faults.without_actions(plan)
     design, flown = planner.over_own_links(design, plan)
     if flown is not plan:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)

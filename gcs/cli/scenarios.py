@@ -21,8 +21,8 @@ _RARE = 0.01
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from gcs.drive.check import ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
+    from gcs.preflight.check import ScenarioCheck, VehicleCheck
 
 
 def scenarios(
@@ -122,13 +122,13 @@ def check(
     Exit code 2 if `gcs fly` would refuse it. --assert-headroom tests two figures: the headroom that 99 % of the
     set-points keep, and the headroom of the effective loop delay, which takes late and lost datagrams into account.
     """
-    from gcs.drive import preflight
-    from gcs.drive.check import check as checked
     from gcs.plan.planner import flight_plan
+    from gcs.preflight import faults
+    from gcs.preflight.check import check as checked
 
     scenario = options.load_scenario(scenario_file, loop, links=links, link_delay_s=link_delay, allow_code=allow_code)
-    options.refuse(scenario_file, preflight.bad_start(scenario))
-    options.refuse(scenario_file, preflight.endless_link(scenario), in_file=link_delay is None and links is None)
+    options.refuse(scenario_file, faults.bad_start(scenario))
+    options.refuse(scenario_file, faults.endless_link(scenario), in_file=link_delay is None and links is None)
     scenario, measured = chosen_for(scenario, links_of)
     design, plan = flight_plan(scenario, measured)
     design, plan = options.flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
@@ -274,10 +274,10 @@ def design(
 
     Shows the gains, their robustness and delay margins, and the trade-off between the two.
     """
-    from gcs.drive.preflight import unstable_loop
     from gcs.plan.criteria import with_bounds
     from gcs.plan.disturbed import with_spread
     from gcs.plan.planner import flight_plan, with_trade_off
+    from gcs.preflight.faults import unstable_loop
     from gcs.views.report import print_design
     from scenarios.files import dump
     from scenarios.keys.own import NO_LAW

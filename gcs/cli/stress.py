@@ -139,7 +139,7 @@ def stress(
     if junit is not None:
         options.out_file("--junit", junit)
     from gcs.cli.results import checks_of, print_reflown, print_result
-    from gcs.drive.preflight import endless_link
+    from gcs.preflight.faults import endless_link
     from gcs.runs.junit import write_junit
     from gcs.stress.axes import parse_axis
     from gcs.stress.campaign import dask_workers, local_workers, refly
@@ -220,8 +220,8 @@ def _study(
     disturbance: bool = False,
 ) -> "tuple[Study, Design]":
     from gcs.drive.flown import identified_in_flight
-    from gcs.drive.preflight import bad_start, unstable_loop
     from gcs.plan.planner import described, flight_plan
+    from gcs.preflight.faults import bad_start, unstable_loop
     from gcs.stress.study import Study
 
     scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)

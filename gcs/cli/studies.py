@@ -27,7 +27,7 @@ def compare(
     Exit code 1 if no method gives a design.
     """
     from gcs.cli.results import print_comparison
-    from gcs.drive.preflight import bad_start, endless_link
+    from gcs.preflight.faults import bad_start, endless_link
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
     from gcs.views.console import progress
@@ -116,7 +116,7 @@ def bench(
     With --cluster, the map is flown twice on Dask: by one local worker and by all. Each trial flies for --seconds.
     """
     from gcs.cli.results import print_benchmark, print_cluster, print_peers, print_real_time
-    from gcs.drive.preflight import bad_start, endless_link
+    from gcs.preflight.faults import bad_start, endless_link
     from gcs.studies import benchmark
 
     given = [name for name, on in (("--peers", peers), ("--cluster", cluster), ("--real-time", real_time)) if on]

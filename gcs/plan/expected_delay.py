@@ -85,7 +85,7 @@ def expected_loop_delays_s(
     control: the first command computed from a state waits between zero and a whole period, depending on the phases of
     vehicle and station. With jitter or losses it is the median over drawn datagrams, averaged over the phases. If
     `heard` names other vehicles for a vehicle, it counts from the oldest of their states instead of its own. The time
-    that datagrams wait for a channel is not included (`waits_for_channels`, `gcs.drive.channels`).
+    that datagrams wait for a channel is not included (`waits_for_channels`, `gcs.preflight.channels`).
     """
     paths = _paths(scenario, heard)
     unlike = dict.fromkeys(paths.values())

@@ -17,9 +17,9 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
 from gcs.control.tick import TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
-from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
+from gcs.preflight.faults import bad_start, endless_link, unstable_loop
 from gcs.published import json_text
 from gcs.runs.files import write_scenario
 from gcs.runs.record import write_whole

@@ -9,10 +9,10 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gcs.control.tick import Event, TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, fly_lockstep
-from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
 from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.plan.planner import described, flight_plan, over_own_links
+from gcs.preflight.faults import bad_start, endless_link, unstable_loop, without_actions
 from gcs.runs.record import END
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary

@@ -5,9 +5,9 @@ import traceback
 from dataclasses import dataclass
 
 from gains.core.errors import DisagreementError, GainsError, SolverError
-from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.preflight.faults import bad_start, endless_link, unstable_loop, without_actions
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Trial, sparse_gain
 from tests.soak.soak_checks import Broken, checked

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from gcs import fly_virtual
-from gcs.drive.check import check
 from gcs.drive.flown import fly_plan
 from gcs.plan.planner import flight_plan, over_own_links
+from gcs.preflight.check import check
 from gcs.runs.summary import summarise
 from scenarios.files import parse
 from scenarios.keys.link import Link, VehicleLinks

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gcs.cli.main import main
-from gcs.drive.check import check
 from gcs.plan.planner import flight_plan
+from gcs.preflight.check import check
 from gcs.runs.files import read_ticks
 from gcs.runs.grade import grade
 from gcs.runs.record import TLOG_FILE

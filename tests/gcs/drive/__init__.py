@@ -1,1 +1,1 @@
-"""Checks before a flight, and flights in virtual time."""
+"""Flights in virtual time: their fast path, and what is compiled before them."""

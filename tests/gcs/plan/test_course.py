@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from gcs.drive.preflight import bad_start
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.formation import plan_formation
+from gcs.preflight.faults import bad_start
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
 

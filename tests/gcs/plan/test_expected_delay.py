@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gcs import fly_virtual
-from gcs.drive.check import check
 from gcs.drive.flown import fly_plan
 from gcs.plan.expected_delay import effective_loop_delays_s, expected_loop_delay_s, planned_loop_delays_s
 from gcs.plan.planner import flight_plan
+from gcs.preflight.check import check
 from gcs.stress.free_response import effective_delays_s
 from scenarios.files import load, with_loop, with_profile
 from scenarios.keys.link import Jitter, Link, Links, LossBursts, VehicleLinks

@@ -7,10 +7,10 @@ from typer.testing import CliRunner
 
 from gcs import fly_virtual
 from gcs.cli.main import app
-from gcs.drive.check import check
 from gcs.errors import InputError
 from gcs.plan.loops import margins_over_links_s, plan_loops
 from gcs.plan.planner import flight_plan, over_own_links
+from gcs.preflight.check import check
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from scenarios.files import dump, load, parse

@@ -1,6 +1,6 @@
 """Studies replace a scenario's vehicles, and with them its manoeuvres."""
 
-from gcs.drive.preflight import bad_start
+from gcs.preflight.faults import bad_start
 from gcs.studies.benchmark import with_vehicles
 from scenarios.files import load
 from tests.support.paths import SCENARIOS

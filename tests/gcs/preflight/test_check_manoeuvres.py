@@ -2,8 +2,8 @@
 
 import pytest
 
-from gcs.drive.check import check
 from gcs.plan.planner import flight_plan
+from gcs.preflight.check import check
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Limits
 from tests.support.paths import SCENARIOS

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gcs.cli.main import app, main
-from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
 from gcs.plan.planner import flight_plan
+from gcs.preflight.faults import bad_start, endless_link, unstable_loop, without_actions
 from gcs.runs.summary import summarise
 from scenarios.files import load
 from scenarios.keys.link import DelayPoint, Link, Links

@@ -1,6 +1,6 @@
-"""Checks before take-off that a scenario and its plan can fly at all.
+"""Why a scenario or its plan cannot be flown at all.
 
-Each check returns one fault as one line (the scenario's key, what was read, what was wanted), or None.
+Each function returns one fault as one line (the scenario's key, what was read, what was wanted), or None.
 """
 
 from dataclasses import replace

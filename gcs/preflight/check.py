@@ -9,7 +9,6 @@ from pydantic import Field
 
 from gains.core.arrays import FloatArray
 from gcs.control.loop_delay import headroom
-from gcs.drive.channels import over_channels
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
 from gcs.plan.expected_delay import (
@@ -25,6 +24,7 @@ from gcs.plan.formation import Formation
 from gcs.plan.loops import link_delays_left_s
 from gcs.plan.mismatch import Tolerated
 from gcs.plan.own_law import code_by_key, law_formation
+from gcs.preflight.channels import over_channels
 from gcs.published import Published
 from scenarios.schema import Scenario
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gcs.control.tick import in_sequence
-from gcs.drive.check import check
 from gcs.drive.lockstep import Sent, fly_lockstep, vehicles_of
 from gcs.plan.planner import flight_plan
+from gcs.preflight.check import check
 from scenarios.files import load
 from scenarios.keys.link import Channel, Link, Links
 from scenarios.schema import Scenario

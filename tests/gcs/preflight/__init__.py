@@ -1,0 +1,1 @@
+"""What is said before a flight: faults, manoeuvres, and delays over channels."""
