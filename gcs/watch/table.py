@@ -16,7 +16,7 @@ NOT_ASKED = "many autopilots send none until a station asks; --request asks"
 RATES_UNKNOWN = "no scenario, so no rates: repetition of a position counts as loop delay"
 _SLOW = 0.9
 """Telemetry below this share of the scenario's rate is reported as slow."""
-_USUAL, _WIDE = 79, 146
+_USUAL, _MORE, _WIDE = 73, 84, 146
 """Terminal widths from which more columns are shown."""
 
 
@@ -68,7 +68,7 @@ def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
         ("id", 3, 0, lambda v: str(v.system_id)),
         ("Hz", 5, _WIDE, lambda v: number_text(v.telemetry_hz, ".1f")),
         ("RTT p50\nms", 8, 0, lambda v: _ms(v.rtt_s.p50)),
-        ("p99\nms", 7, _USUAL, lambda v: _ms(v.rtt_s.p99)),
+        ("p99\nms", 7, _MORE, lambda v: _ms(v.rtt_s.p99)),
         ("age p50\nms", 8, _WIDE, lambda v: _ms(v.telemetry_age_s.p50, _bound(v))),
         ("p99\nms", 7, _WIDE, lambda v: _ms(v.telemetry_age_s.p99, _bound(v))),
         ("loop p50\nms", 8, _USUAL, lambda v: _ms(v.loop_delay_s.p50, _bound(v))),

@@ -267,7 +267,7 @@ def test_any_stream_is_taken_and_figures_are_plain_numbers(
     figures.to_json()  # which has no infinity
 
 
-@pytest.mark.parametrize("width", [50, 78, 79, 80, 145, 146, 200])
+@pytest.mark.parametrize("width", [50, 72, 73, 80, 83, 84, 145, 146, 200])
 def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
     watched.run(1.5)
