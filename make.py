@@ -88,7 +88,7 @@ def install() -> None:
 
 def compile_kernels() -> None:
     """Compile what runs for every frame, which the first flight would do otherwise."""
-    print("compiling what runs for every frame (a minute; kept in ~/.cache/formation-gcs)", flush=True)
+    print("compiling what runs for every frame (one or two minutes; kept in ~/.cache/formation-gcs)", flush=True)
     flight = [str(VENV / "bin" / "gcs"), "bench", "chain3", "--seconds", "1", "--repeat", "1"]
     subprocess.run(flight, check=True, stdout=subprocess.DEVNULL, cwd=VENV)
 

@@ -117,7 +117,7 @@ class _Kernel:
             # inlined, as a call that passes a tuple copies every array in it, a tenth of a flight's time
             compiled = compiler.njit(
                 _nrt=self._makes_arrays,
-                forceinline=True,
+                forceinline=not settings.BOUNDSCHECK,  # faster flights, longer compilation
                 no_cfunc_wrapper=True,
                 no_cpython_wrapper=not for_python,
             )(self._function)

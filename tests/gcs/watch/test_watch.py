@@ -288,11 +288,11 @@ def test_lost_positions_lengthen_the_effective_loop_delay() -> None:
     lossy = linked(Link(delay_s=0.03, loss_probability=0.3), Link(delay_s=0.02)).model_copy(update={"rates": rates})
     watched = Watched(lossy, timesync_hz=10.0, rates=rates)
     interval = command(SET_MESSAGE_INTERVAL, float(mavlink.LOCAL_POSITION_NED), 50_000.0)
-    watched.run(60.0, [(1, heartbeat(), START_NS), (1, interval, START_NS + 100 * MS)])
+    watched.run(30.0, [(1, heartbeat(), START_NS), (1, interval, START_NS + 100 * MS)])
     [expected_s] = set(effective_loop_delays_s(flight_plan(lossy)[1]).values())
     figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.3))[0]
     effective_s = known(figures.effective_loop_delay_s)
-    assert effective_s == pytest.approx(expected_s, rel=0.05)  # 1,200 positions, of which 300 to 400 are lost
+    assert effective_s == pytest.approx(expected_s, rel=0.05)  # 600 positions, of which 150 to 200 are lost
     assert figures.effective_headroom == pytest.approx(1.0 - effective_s / 0.3)
     assert known(figures.loop_delay_s.p50) < 0.93 * effective_s < 0.7 * known(figures.loop_delay_s.p99)
 
