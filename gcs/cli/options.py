@@ -133,7 +133,7 @@ def explain_compiling() -> None:
     """Explain on a terminal why the first flight on a machine, or after an update, starts late."""
     from scenarios.kernel import before_compiling
 
-    text = "compiling what runs for every frame, one or two minutes: it is kept for the next flights"
+    text = "compiling the code that runs for every frame: one or two minutes, kept for later flights"
     if sys.stderr.isatty() and not before_compiling:
         before_compiling.append(lambda: print(text, file=sys.stderr))
 

@@ -227,7 +227,7 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     if found.channels_not_included:
         yield "         next to nothing reaches some vehicle: the other figures are without the channel"
     elif found.channel_use:
-        yield "         the delays above include the waits for it, from short virtual flights; the design's do not"
+        yield "         the delays above include the waits for it, seen in short virtual flights; the design's do not"
     if found.outage_s is not None:
         yield f"         without the outages of links, of up to {found.outage_s:g} s"
     if found.setpoint_gaps > _RARE:

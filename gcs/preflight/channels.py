@@ -75,11 +75,12 @@ def _over_wide(plan: FlightPlan) -> FlightPlan:
 
 
 def _start(plan: FlightPlan, seed: int) -> OverChannels:
-    """The second half of one short flight; nothing in it if the flight does not begin."""
+    """The second half of one short flight, which no error of the formation ends; nothing in it if it does not begin."""
     calm = plan.scenario.with_calm_monitor()
     lasts_s = max(_SECONDS, _PERIODS / calm.rates.telemetry_hz)
     vehicles = (own.model_copy(update={"altitude_m": min(calm.altitude_of(own), _ALTITUDE_M)}) for own in calm.vehicles)
-    low = {"seed": seed, "duration_s": lasts_s, "vehicles": tuple(vehicles)}
+    endless = calm.safety.model_copy(update={"spacing_error_limit_m": inf, "collision_distance_m": 0.0})
+    low = {"seed": seed, "duration_s": lasts_s, "vehicles": tuple(vehicles), "safety": endless}
     known = plan.responses or Responses("given", dict.fromkeys(plan.formation.system_ids, _ANY))
     plan, truth = replace(plan, scenario=calm.model_copy(update=low), responses=known), MemoryRecorder()
     station, fleet = Station(plan, start_ns=START_NS), vehicles_of(plan.scenario, recorder=truth)

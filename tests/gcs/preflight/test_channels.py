@@ -40,6 +40,14 @@ def test_expected_and_late_loop_delays_are_those_of_flights() -> None:
     assert not found.channels_not_included
 
 
+def test_a_formation_that_would_be_broken_shows_its_delays_all_the_same() -> None:
+    """Vehicle 3 starts 2.4 m off."""
+    safety = RADIO.safety.model_copy(update={"spacing_error_limit_m": 1.0})
+    found = check(flight_plan(RADIO.model_copy(update={"safety": safety}))[1])
+    assert not found.channels_not_included
+    assert found.expected_loop_delay_s > 0.1
+
+
 class Counted:
     """Vehicles whose datagrams are counted where the station sends and receives them."""
 
