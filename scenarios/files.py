@@ -19,7 +19,7 @@ from scenarios.errors import InWords, ScenarioError, UnreadableError, did_you_me
 from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link, Links
 from scenarios.keys.part import Fault
-from scenarios.link_files import each_link, load_profile, with_traces
+from scenarios.link_files import each_link, load_profile, toml_text, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code
 from scenarios.places import place_of, wanted_of
@@ -112,9 +112,7 @@ def with_line(fault: str, file: Path) -> str:
 
 def dump(scenario: Scenario) -> str:
     """The scenario as TOML text that `parse` reads back to an equal object, beside `scenarios.own_code.write_code`."""
-    import tomlkit
-
-    return tomlkit.dumps(as_flown(scenario).model_dump(mode="json", exclude_none=True, exclude={"code"}))
+    return toml_text(as_flown(scenario).model_dump(mode="json", exclude_none=True, exclude={"code"}))
 
 
 def fingerprint(scenario: Scenario) -> str:

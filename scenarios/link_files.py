@@ -4,8 +4,9 @@ import contextlib
 import csv
 import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 from pydantic_core import to_json
@@ -45,9 +46,28 @@ def load_profile(name: str, beside: Path, key: str) -> LinkProfile:
 
 def dump_profile(profile: LinkProfile) -> str:
     """The profile as TOML text."""
-    import tomlkit
+    return toml_text(profile.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
 
-    return tomlkit.dumps(profile.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
+
+def toml_text(data: Mapping[str, Any]) -> str:
+    """TOML text of tables, lists and values.
+
+    tomlkit renumbers a list for each element that it appends, so lists of values, such as traces, are made whole.
+    """
+    import tomlkit
+    from tomlkit.items import Array, Trivia, Whitespace
+
+    def whole(part: Any) -> Any:
+        if isinstance(part, dict):
+            return {key: whole(value) for key, value in part.items()}
+        if not isinstance(part, list):
+            return part
+        if not part or any(isinstance(value, dict | list) for value in part):
+            return [whole(value) for value in part]
+        items: list[Any] = [item for value in part for item in (Whitespace(", "), tomlkit.item(value))]
+        return Array(items[1:], Trivia())
+
+    return tomlkit.dumps(whole(data))
 
 
 def each_link(links: Links) -> Iterator[tuple[str, Link]]:
