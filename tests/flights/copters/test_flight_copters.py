@@ -161,6 +161,7 @@ def test_the_margin_is_that_of_the_velocity_flown_where_the_air_resists() -> Non
     assert not settled(at_loop_delay(plan_for(resisted), 1.1 * margin_s))
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_start_up_goes_through_losses_and_refusals(flavour: str, seed: int) -> None:

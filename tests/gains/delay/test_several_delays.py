@@ -60,6 +60,7 @@ def test_curves_are_roots_on_the_imaginary_axis(seed: int) -> None:
     assert max(residual(matrices, line) for line in lines) < 1e-12
 
 
+@pytest.mark.slow(first=5)
 @pytest.mark.parametrize("seed", [2, 5, 7, 8, 9, 14, 16, 17, 19, 23])
 def test_edge_on_the_diagonal_is_the_margin_of_one_delay(seed: int) -> None:
     A0, A1, A2 = random_loop(seed)
@@ -196,6 +197,7 @@ def test_box_of_curves_must_be_finite(longest_s: tuple[float, float]) -> None:
         crossing_curves([[-1.0]], [[1.0]], [[1.0]], longest_s=longest_s)
 
 
+@pytest.mark.slow(first=12)
 @pytest.mark.parametrize("seed", range(24))
 def test_curves_reach_the_axes(seed: int) -> None:
     now, first, second = random_loop(seed)
