@@ -97,38 +97,44 @@ class _Kernel:
         return compiled
 
     def _dispatcher(self, *, for_python: bool) -> Any:
-        """Numba's dispatcher, which compiles the function at the first call with each combination of argument types."""
+        """Numba's dispatcher, which compiles the function at the first call with each combination of argument types.
+
+        The lock is for threads: the cache folder is a setting of the process.
+        """
         import numba
         from numba.core import config
+        from numba.core.compiler_lock import global_compiler_lock
 
         from scenarios import kernel_cache
 
         settings: Any = config
         compiler: Any = numba
-        folder, before = _cache(settings.CACHE_DIR), (settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES)
-        # a cache folder for each state of the source: Numba's own index does not see what a kernel calls
-        settings.CACHE_DIR = (
-            ""
-            if folder is None
-            else str(folder / f"{self._stamp}={settings.BOUNDSCHECK}{self._makes_arrays:d}{for_python:d}")
-        )
-        settings.CACHE_LOCATOR_CLASSES = "scenarios.kernel_cache.AnyClone"
-        try:
-            # inlined, as a call that passes a tuple copies every array in it: flights take an eighth less time, and
-            # compilation a third more; bounds are checked in tests only
-            compiled = compiler.njit(
-                _nrt=self._makes_arrays,
-                forceinline=not settings.BOUNDSCHECK,
-                no_cfunc_wrapper=True,
-                no_cpython_wrapper=not for_python,
-            )(self._function)
-            if folder is None:
-                _announce()
-            else:
-                compiled._cache = kernel_cache.KernelCache(self._function, _announce)
-            return compiled
-        finally:
-            settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
+        lock: Any = global_compiler_lock
+        with lock:
+            folder, before = _cache(settings.CACHE_DIR), (settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES)
+            # a cache folder for each state of the source: Numba's own index does not see what a kernel calls
+            settings.CACHE_DIR = (
+                ""
+                if folder is None
+                else str(folder / f"{self._stamp}={settings.BOUNDSCHECK}{self._makes_arrays:d}{for_python:d}")
+            )
+            settings.CACHE_LOCATOR_CLASSES = "scenarios.kernel_cache.AnyClone"
+            try:
+                # inlined, as a call that passes a tuple copies every array in it: flights take an eighth less time, and
+                # compilation a third more; bounds are checked in tests only
+                compiled = compiler.njit(
+                    _nrt=self._makes_arrays,
+                    forceinline=not settings.BOUNDSCHECK,
+                    no_cfunc_wrapper=True,
+                    no_cpython_wrapper=not for_python,
+                )(self._function)
+                if folder is None:
+                    _announce()
+                else:
+                    compiled._cache = kernel_cache.KernelCache(self._function, _announce)
+                return compiled
+            finally:
+                settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
 
     def _called(self) -> "list[_Kernel]":
         names, known = self._function.__code__.co_names, self._function.__globals__

@@ -6,6 +6,7 @@ import pkgutil
 import signal
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
@@ -96,6 +97,29 @@ def test_what_one_copy_of_the_source_compiled_no_other_compiles(
         known.append(sum(square._compiled.stats.cache_hits.values()))
     assert known == [0, 1, 0]
     assert announced == ["first", "changed"]
+
+
+def test_threads_that_call_kernels_for_the_first_time_find_one_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a worker of a cluster with several threads."""
+    from numba.core import config
+
+    settings: Any = config
+    monkeypatch.setattr(settings, "CACHE_DIR", str(tmp_path))
+    file = tmp_path / "several.py"
+    head = "from scenarios.kernel import kernel\n"
+    file.write_text(head + "".join(f"\n\n@kernel\ndef plus_{k}(n):\n    return n + {k}\n" for k in range(32)))
+    several = loaded(file)
+
+    def added(k: int) -> int:
+        return getattr(several, f"plus_{k}")(1)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert [*pool.map(added, range(32))] == [*range(1, 33)]
+    assert str(tmp_path) == settings.CACHE_DIR
+    folders = {path.parent for path in tmp_path.rglob("*.nbi")}
+    assert len(folders) == 32
 
 
 @pytest.mark.parametrize(
