@@ -115,6 +115,15 @@ def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) 
     )
 
 
+def first_critical_delay_s(blocks: Sequence[BlockAnalysis]) -> float:
+    """The delay margin (s) of a loop, from the analyses of its blocks; the windows after it are not listed."""
+    crossings = [crossing for block in blocks for crossing in block.crossings]
+    leaving = any(crossing.delay_s == 0.0 and crossing.direction > 0 for crossing in crossings)
+    if leaving or any(block.fixed_on_axis or block.unstable > 0 for block in blocks):
+        return 0.0
+    return min((crossing.delay_s or 2.0 * pi / crossing.omega_rad_s for crossing in crossings), default=inf)
+
+
 def _windows(
     blocks: Sequence[BlockAnalysis], crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
 ) -> tuple[tuple[tuple[float, float], ...], float]:

@@ -14,7 +14,7 @@ from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, is_number, shown, square_matrices
 from gains.delay._commensurate import analyse_block
 from gains.delay._crossings import Crossing
-from gains.delay._windows import DelayAnalysis, combined_analysis
+from gains.delay._windows import DelayAnalysis, combined_analysis, first_critical_delay_s
 
 __all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin"]
 
@@ -55,5 +55,5 @@ def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     >>> round(delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """
-    # only the first critical delay is wanted: the shortest horizon lists the fewest windows
-    return analyse_delay(A0, A1, horizon_s=1e-300).delay_margin_s
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    return first_critical_delay_s([analyse_block(block, leave_out_zero=False) for block in blocks])

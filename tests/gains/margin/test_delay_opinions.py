@@ -56,6 +56,13 @@ def test_windows_of_random_loops_are_those_of_the_rightmost_root(seed: int) -> N
 
 
 @pytest.mark.parametrize("part", PARTS)
+def test_the_margin_alone_is_that_of_all_windows(part: int) -> None:
+    for seed in range(50 * part, 50 * part + 50):
+        A0, A1 = random_loop(seed)
+        assert delay_margin(A0, A1) == analyse_delay(A0, A1).delay_margin_s
+
+
+@pytest.mark.parametrize("part", PARTS)
 def test_margin_scales_with_time(part: int) -> None:
     for seed in range(50 * part, 50 * part + 50):
         A0, A1 = random_loop(seed)
