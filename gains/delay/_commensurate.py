@@ -29,7 +29,7 @@ from gains.delay._crossings import (
     crossings_of_loci,
     hidden_crossings,
     near_axis,
-    polish,
+    polished,
     separating_points,
 )
 from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings, with_extrema
@@ -113,7 +113,7 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
     """
     loci, candidates = circle_loci(terms), _candidate_angles(terms)
     counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, _PAST_HALF)))
-    crossings: list[Crossing] = []
+    crossings: list[UnitCrossing] = []
     # crossings in opposite directions at one angle are common: if all multiples are odd, all cross at a quarter turn
     for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
         theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
@@ -122,9 +122,8 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
         # angles beyond pi mirror these with negative frequencies; outward means that Re s falls: to the left
         turn, way = (theta, -1) if omega > 0.0 else (2.0 * pi - theta, 1)
         if theta <= pi:
-            locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
-            crossings.append(polish(terms, locus))
-    return sorted(crossings, key=lambda crossing: crossing.omega_rad_s)
+            crossings.append(UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward))
+    return polished(terms, crossings)
 
 
 def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:

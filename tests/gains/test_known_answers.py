@@ -5,7 +5,8 @@ import pytest
 
 from gains.core._bracketing import highest
 from gains.core.structure import is_singular_for_any_delay
-from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null
+from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null, polished
+from gains.delay._loci import UnitCrossing
 from gains.delay._mixed import count_unstable_roots
 from gains.delay._windows import ZeroPassage, zero_passage
 from gains.delay.constant import delay_margin
@@ -30,6 +31,19 @@ def test_a_pair_of_roots_is_unstable_beyond_the_margin() -> None:
 def test_a_simple_crossing_is_known_to_rounding() -> None:
     [(_, delay_error_s)] = crossing_errors([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], [(1.0, np.pi / 2.0)])
     assert 0.0 < delay_error_s < 1e-14
+
+
+@pytest.mark.parametrize("multiple", [1, 2])
+def test_a_crossing_off_by_a_little_is_off_by_its_square_after_a_step(multiple: int) -> None:
+    """s = a + b e^{-s k tau} crosses at omega^2 = b^2 - a^2, cos(k theta) = -a / b."""
+    a, b = -1.0, -2.0
+    terms = [np.array([[a]]), *(np.zeros((1, 1)) for _ in range(multiple - 1)), np.array([[b]])]
+    omega, theta = np.sqrt(3.0), np.arccos(-a / b) / multiple
+    beside = UnitCrossing((1.0 + 1e-8) * omega, complex(np.exp(1j * (theta - 1e-8))), 1)
+    [found] = polished(terms, [beside])
+    # the square is as small as rounding
+    assert (found.omega_rad_s, found.delay_s) == pytest.approx((omega, theta / omega), rel=1e-14)
+    assert polished(terms, [UnitCrossing(2.0 * omega, beside.locus, 1)]) == []
 
 
 @pytest.mark.parametrize("together", [1, 2])
