@@ -80,13 +80,13 @@ def bracketed_roots(function: Functions, a: FloatArray, b: FloatArray, fa: Float
     Chandrupatla's method: inverse quadratic interpolation where it is safe, bisection elsewhere. `function` takes all
     abscissae (k,) and returns all values (k,); `fa` and `fb` differ in sign.
     """
-    a, b, fa, fb = a.copy(), b.copy(), fa.copy(), fb.copy()
-    c, fc = a.copy(), fa.copy()
-    fraction: FloatArray = np.full(a.size, 0.5)
+    fraction: FloatArray | float = 0.5
     # 100 halvings exhaust any bracket of doubles; interpolation needs about 6
     for _ in range(100):
         x = a + fraction * (b - a)
         fx = function(x)
+        if not fx.any():
+            return x
         same = np.sign(fx) == np.sign(fa)
         c, fc = np.where(same, a, b), np.where(same, fa, fb)
         b, fb = np.where(same, b, a), np.where(same, fb, fa)

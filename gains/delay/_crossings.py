@@ -21,6 +21,7 @@ from gains.delay._loci import (
     delay_loci,
     factor_rank,
     highest_frequency,
+    remembered,
     slope_sign,
     sweep_frequencies,
     unit_crossings,
@@ -37,6 +38,9 @@ _CANDIDATE_TOLERANCE = 1e-3
 _TOUCH = 1e-11
 # largest least singular value at a crossing, relative to the sum of the norms of the terms: rounding is far below
 _RESIDUAL = 1e-5
+_EPS = float(np.finfo(np.float64).eps)
+# a log modulus this small is zero to rounding
+_ROUNDING = 2.0 * _EPS
 # rad; the angle of a computed unit eigenvalue is known to a few hundred eps
 _ZERO_ANGLE = 1e-11
 # backward error of a crossing, in units of n eps and the norm: rounding of the matrices, a similarity, an eigenvalue
@@ -94,9 +98,11 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
 def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: FloatArray) -> list[Crossing]:
     """All crossings of one block, touches included, given candidate frequencies near each of them."""
     highest = highest_frequency(terms)
-    crossings = unit_crossings(loci, separating_points(candidates, highest))
-    found = without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
-    return polished(terms, found)
+    points = separating_points(candidates, highest)
+    loci = remembered(loci, np.concatenate([points, candidates]))
+    crossings = unit_crossings(loci, points, zero=_ROUNDING)
+    crossings += hidden_crossings(loci, candidates, crossings)
+    return polished(terms, without_limits_at_zero(loci, crossings, highest))
 
 
 def near_axis(roots: ComplexArray, terms: Sequence[FloatArray]) -> FloatArray:
@@ -230,7 +236,7 @@ def _error(
         u, v = (U @ left[:, -1]).conj(), V @ right[-1].conj()
         by_omega = 1j * complex(u @ by_s @ v)
         by_tau = 1j * omega * complex(u @ np.tensordot(multiples, turned, axes=1) @ v)
-        epsilon = _BACKWARD * n * float(np.finfo(np.float64).eps) * scale
+        epsilon = _BACKWARD * n * _EPS * scale
         determinant = abs((by_omega.conjugate() * by_tau).imag)
         if omega == 0.0:
             # a real root passes the one at zero: its delay is a ratio of two numbers

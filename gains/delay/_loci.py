@@ -81,6 +81,19 @@ def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
     return omega[(omega > 0.0) & (omega <= highest)]
 
 
+def remembered(loci: Loci, omega: FloatArray) -> Loci:
+    """The loci as a function that evaluates no frequency twice; it begins with `omega` (k,), all together."""
+    known = dict(zip(omega.tolist(), loci(omega), strict=True))
+
+    def remembering(omega: FloatArray) -> ComplexArray:
+        wanted = omega.tolist()
+        if new := [each for each in dict.fromkeys(wanted) if each not in known]:
+            known.update(zip(new, loci(np.array(new)), strict=True))
+        return np.array([known[each] for each in wanted])
+
+    return remembering
+
+
 def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | float = 0.0) -> Loci:
     """A function from omega (k,) to the eigenvalues (k, r) of C (j omega I - A0)^{-1} B + D."""
     identity = np.eye(A0.shape[0])
@@ -125,11 +138,11 @@ def log_moduli(values: ComplexArray) -> FloatArray:
     return -np.sort(-_log(values), axis=-1)
 
 
-def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
+def unit_crossings(loci: Loci, points: FloatArray, *, zero: float = 0.0) -> list[UnitCrossing]:
     """All crossings of the unit circle that change the number of moduli above one between neighbouring `points`.
 
     The points are ascending frequencies. They must separate crossings in opposite directions, but not crossings in the
-    same direction.
+    same direction. A log modulus of at most `zero` is taken for zero.
     """
     logs = log_moduli(loci(points))
     above = np.count_nonzero(logs > 0.0, axis=1)
@@ -139,7 +152,8 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     at, nth = np.array(crossed).T
 
     def nth_log(omega: FloatArray) -> FloatArray:
-        return log_moduli(loci(omega))[np.arange(omega.size), nth]
+        found = log_moduli(loci(omega))[np.arange(omega.size), nth]
+        return found * (np.abs(found) > zero)
 
     omega = bracketed_roots(nth_log, points[at], points[at + 1], logs[at, nth], logs[at + 1, nth])
     outward = np.sign(above[at] - above[at + 1])

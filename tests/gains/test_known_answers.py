@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from gains.core._bracketing import highest
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.structure import is_singular_for_any_delay
 from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null, polished
-from gains.delay._loci import UnitCrossing
+from gains.delay._loci import UnitCrossing, remembered
 from gains.delay._mixed import count_unstable_roots
 from gains.delay._windows import ZeroPassage, zero_passage
 from gains.delay.constant import delay_margin
@@ -44,6 +45,18 @@ def test_a_crossing_off_by_a_little_is_off_by_its_square_after_a_step(multiple: 
     # the square is as small as rounding
     assert (found.omega_rad_s, found.delay_s) == pytest.approx((omega, theta / omega), rel=1e-14)
     assert polished(terms, [UnitCrossing(2.0 * omega, beside.locus, 1)]) == []
+
+
+def test_loci_are_evaluated_once_at_a_frequency() -> None:
+    asked: list[list[float]] = []
+
+    def doubled(omega: FloatArray) -> ComplexArray:
+        asked.append(omega.tolist())
+        return (2j * omega[:, np.newaxis]).astype(np.complex128)
+
+    loci = remembered(doubled, np.array([1.0, 2.0]))
+    assert loci(np.array([2.0, 3.0, 3.0, 1.0])).tolist() == [[4j], [6j], [6j], [2j]]
+    assert asked == [[1.0, 2.0], [3.0]]
 
 
 @pytest.mark.parametrize("together", [1, 2])
