@@ -65,7 +65,7 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
         raise BadModelError(f"{name} has shape {matrix.shape}; a matrix with at least one row and column is wanted")
     if not np.isfinite(matrix).all():
         raise BadModelError(f"{name} has entries that are not finite; finite numbers are wanted")
-    return matrix.astype(np.float64)
+    return matrix.astype(np.float64, copy=False)
 
 
 def positive_seconds(name: str, value: float) -> float:
@@ -153,9 +153,12 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
     Two blocks are equal if they agree to the last bit with the states in ascending order. 400 identical followers,
     described one after the other, give one block.
     """
+    blocks = strongly_connected_blocks(*matrices)
+    if len(blocks) == 1:
+        return [Block(1, tuple(matrix.astype(np.float64, order="C") for matrix in matrices))]
     first: dict[bytes, IntArray] = {}
     copies: dict[bytes, int] = {}
-    for indices in strongly_connected_blocks(*matrices):
+    for indices in blocks:
         rows = indices[:, np.newaxis]
         # + 0.0 turns -0.0 into 0.0: the same number, but different bytes
         key = b"".join((matrix[rows, indices] + 0.0).tobytes() for matrix in matrices)
@@ -216,7 +219,7 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
     """
     if len(matrices[0]) == 1:
         return matrices
-    weight = np.sum([np.abs(matrix) for matrix in matrices], axis=0)
+    weight = sum((np.abs(matrix) for matrix in matrices[1:]), np.abs(matrices[0]))
     np.fill_diagonal(weight, 0.0)
     size = weight.shape[0]
     exponent = np.zeros(size)

@@ -18,7 +18,7 @@ from math import pi
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, norm_of
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, is_singular_for_any_delay
 from gains.delay._crossings import (
@@ -28,7 +28,6 @@ from gains.delay._crossings import (
     axis_crossings,
     crossings_of_loci,
     hidden_crossings,
-    near_axis,
     polished,
     separating_points,
 )
@@ -65,13 +64,14 @@ def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
         )
     terms = balanced(*block.matrices)
     delayed = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(terms)]
-    roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
+    roots = np.linalg.eigvals(sum(terms[1:], terms[0])).astype(np.complex128)
     passage = zero_passage(terms, np.zeros(len(terms)), np.arange(len(terms))) if leave_out_zero else None
     if passage is None and _has_fixed_root(terms, roots):
         # a simple eigenvalue on the axis may be this far off by rounding
         unstable = int(np.count_nonzero(roots.real > 1e-13 * norm_of(terms)))
         return BlockAnalysis(block.copies, delayed, unstable=unstable, fixed_on_axis=True)
-    found = without_zero(_block_crossings(terms), passage, highest_frequency(terms))
+    found = _block_crossings(terms)
+    found = found if passage is None else without_zero(found, passage, highest_frequency(terms))
     return block_analysis(block.copies, delayed, found, unstable_roots(roots, found, passage), passage)
 
 
@@ -102,8 +102,8 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     def terms_at(omega: FloatArray) -> ComplexArray:
         return np.broadcast_to(np.array(used, dtype=np.complex128), (omega.size, len(used), *used[0].shape))
 
-    loci = companion_loci(terms_at, space)
-    return crossings_of_loci(used, loci, _candidates(used))
+    places = np.linalg.eigvals(at_angle(used, _candidate_angles(used))).astype(np.complex128)
+    return crossings_of_loci(used, companion_loci(terms_at, space), places)
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
@@ -131,8 +131,7 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
     scale = norm_of(terms)
     if scale == 0.0:
         return True
-    for root in roots[np.abs(roots.real) < 1e-6 * scale]:
-        omega = abs(float(root.imag))
+    for omega in (abs(root.imag) for root in roots.tolist() if abs(root.real) < 1e-6 * scale):
         if omega < 1e-6 * scale:
             # a defective root at zero is known only to sqrt(eps), so the singular value decides, not the eigenvalue
             if is_singular_for_any_delay(terms):
@@ -175,17 +174,6 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
     beside = np.hstack(late)
     U, singular, _ = np.linalg.svd(beside, full_matrices=False)
     return U[:, : int(np.count_nonzero(singular > beside.shape[1] * np.finfo(float).eps * singular[0]))]
-
-
-def _candidates(terms: Sequence[FloatArray]) -> FloatArray:
-    """Ascending frequencies, one of which is near every crossing."""
-    theta = _candidate_angles(terms)
-    return near_axis(np.linalg.eigvals(at_angle(terms, theta)).astype(np.complex128), terms) if theta.size else theta
-
-
-def norm_of(terms: Sequence[FloatArray]) -> float:
-    """Sum of the Frobenius norms, a bound on every eigenvalue of A(theta)."""
-    return sum(float(np.linalg.norm(matrix)) for matrix in terms)
 
 
 def circle_loci(terms: Sequence[FloatArray]) -> Loci:

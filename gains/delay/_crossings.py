@@ -9,11 +9,12 @@ error, which at a multiple root is large for any method.
 import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import inf
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray, IntArray
+from gains.core.arrays import ComplexArray, FloatArray, IntArray, norm_of
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import (
     Loci,
@@ -21,6 +22,7 @@ from gains.delay._loci import (
     delay_loci,
     factor_rank,
     highest_frequency,
+    log_abs,
     remembered,
     slope_sign,
     sweep_frequencies,
@@ -92,12 +94,13 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
     B, C = factor_rank(A1)
     if B.shape[1] == 0:
         return []
-    return crossings_of_loci((A0, A1), delay_loci(A0, B, C), _candidates(A0, A1, B, C))
+    return crossings_of_loci((A0, A1), delay_loci(A0, B, C), _near_crossings(A0, A1, B, C))
 
 
-def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: FloatArray) -> list[Crossing]:
-    """All crossings of one block, touches included, given candidate frequencies near each of them."""
+def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, places: ComplexArray) -> list[Crossing]:
+    """All crossings of one block, touches included; each is near one of the complex numbers `places`."""
     highest = highest_frequency(terms)
+    candidates = _near_axis(places, highest)
     points = separating_points(candidates, highest)
     loci = remembered(loci, np.concatenate([points, candidates]))
     crossings = unit_crossings(loci, points, zero=_ROUNDING)
@@ -105,22 +108,19 @@ def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: Float
     return polished(terms, without_limits_at_zero(loci, crossings, highest))
 
 
-def near_axis(roots: ComplexArray, terms: Sequence[FloatArray]) -> FloatArray:
+def _near_axis(roots: ComplexArray, highest: float) -> FloatArray:
     """Ascending frequencies of the roots that are near the imaginary axis and below the bound on crossings."""
-    highest = highest_frequency(terms)
-    omega = np.unique(np.abs(roots.imag[np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))]))
-    return omega[(omega > 0.0) & (omega < 1.1 * highest)]
+    near = (root for root in roots.ravel().tolist() if abs(root.real) <= _CANDIDATE_TOLERANCE * (highest + abs(root)))
+    return np.array(sorted({abs(root.imag) for root in near if 0.0 < abs(root.imag) < 1.1 * highest}))
 
 
-def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
-    """Ascending frequencies, one of which is near every crossing; by a sweep if the block is large."""
+def _near_crossings(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
+    """Numbers, one of which is near every crossing of the imaginary axis; of a sweep if the block is large."""
     if B.shape[1] == 1:
-        roots = unit_gain_roots(A0, B, C)
-    elif A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
-        roots = _kronecker_roots(A0, A1)
-    else:
-        return sweep_frequencies(A0, A1)
-    return near_axis(roots, (A0, A1))
+        return unit_gain_roots(A0, B, C)
+    if A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
+        return _kronecker_roots(A0, A1)
+    return (1j * sweep_frequencies(A0, A1)).astype(np.complex128)
 
 
 def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
@@ -138,11 +138,10 @@ def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
 
 def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
     """Ascending frequencies that bracket every candidate narrowly and separate it from its neighbours."""
-    lowest = 1e-12 * highest
-    middles = (candidates[1:] + candidates[:-1]) / 2.0
-    margin = 1e-7 * candidates + 1e-15 * highest
-    points = np.concatenate([[lowest, 1.1 * highest], middles, candidates - margin, candidates + margin])
-    return np.unique(points[(points >= lowest) & (points <= 1.1 * highest)])
+    ends, known = (1e-12 * highest, 1.1 * highest), candidates.tolist()
+    beside = [each + way * (1e-7 * each + 1e-15 * highest) for each in known for way in (-1.0, 1.0)]
+    points = {*ends, *beside, *((before + after) / 2.0 for before, after in pairwise(known))}
+    return np.array(sorted(each for each in points if ends[0] <= each <= ends[1]))
 
 
 def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
@@ -150,12 +149,12 @@ def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossin
     if candidates.size == 0:
         return []
     values = loci(candidates)
+    row, column = np.nonzero(np.abs(log_abs(values)) < _TOUCH)
     hidden: list[UnitCrossing] = []
-    for omega, row in zip(candidates.tolist(), values, strict=True):
-        for locus in row[np.abs(np.log(np.clip(np.abs(row), 1e-300, 1e300))) < _TOUCH].tolist():
-            known = (*found, *hidden)
-            if not any(abs(c.omega - omega) < 1e-6 * omega and abs(c.locus - locus) < 1e-4 for c in known):
-                hidden.append(UnitCrossing(omega=omega, locus=locus, outward=slope_sign(loci, omega, locus)))
+    for omega, locus in zip(candidates[row].tolist(), values[row, column].tolist(), strict=True):
+        known = (*found, *hidden)
+        if not any(abs(c.omega - omega) < 1e-6 * omega and abs(c.locus - locus) < 1e-4 for c in known):
+            hidden.append(UnitCrossing(omega=omega, locus=locus, outward=slope_sign(loci, omega, locus)))
     return hidden
 
 
@@ -182,7 +181,7 @@ def _polish(terms: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing | N
     M.flat[:: len(M) + 1] += 1j * omega
     U, sizes, Vh = np.linalg.svd(M)
     *larger, least = sizes.tolist()
-    if least > _RESIDUAL * (omega + sum(float(np.linalg.norm(matrix)) for matrix in terms)):
+    if least > _RESIDUAL * (omega + norm_of(terms)):
         return None
     if not larger or larger[-1] >= 1e-6 * larger[0]:
         u, v = U[:, -1].conj(), Vh[-1].conj()

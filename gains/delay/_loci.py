@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots, may_reach_zero, peaks
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, norm_of
 
 Loci = Callable[[FloatArray], ComplexArray]
 
@@ -56,15 +56,15 @@ class UnitCrossing:
 def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """B (n, r) and C (r, n), of equal norm, with B C = `matrix` to rounding; r is its numerical rank."""
     U, singular, Vh = np.linalg.svd(matrix)
-    rank = int(np.count_nonzero(singular > matrix.shape[0] * _EPS * singular[0])) if singular[0] > 0.0 else 0
+    sizes = singular.tolist()
+    rank = sum(size > len(matrix) * _EPS * sizes[0] for size in sizes)
     root = np.sqrt(singular[:rank])
     return U[:, :rank] * root, root[:, np.newaxis] * Vh[:rank]
 
 
 def highest_frequency(terms: Sequence[FloatArray]) -> float:
     """Bound (rad/s) on every root on the imaginary axis, whatever the delays; terms[0] acts without delay."""
-    turning = float(np.linalg.norm(terms[0] - terms[0].T)) / 2.0
-    return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
+    return norm_of([terms[0] - terms[0].T]) / 2.0 + norm_of(terms[1:])
 
 
 def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
@@ -96,10 +96,11 @@ def remembered(loci: Loci, omega: FloatArray) -> Loci:
 
 def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | float = 0.0) -> Loci:
     """A function from omega (k,) to the eigenvalues (k, r) of C (j omega I - A0)^{-1} B + D."""
-    identity = np.eye(A0.shape[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
-        loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B) + D
+        resolvent = np.zeros((omega.size, *A0.shape), dtype=np.complex128) - A0
+        resolvent.reshape(omega.size, -1)[:, :: len(A0) + 1] += 1j * omega[:, np.newaxis]
+        loop = C @ solved_beside_poles(resolvent, B) + D
         return (loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop)).astype(np.complex128, copy=False)
 
     return loci
@@ -112,8 +113,11 @@ def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0)
     """
     # |D| = 1 sends one solution to infinity
     rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
-    corner = A + B @ C * (D / rest)
-    return np.linalg.eigvals(np.block([[corner, B @ B.T / rest], [-C.T @ C / rest, -corner.T]])).astype(np.complex128)
+    corner, n = A + B @ C * (D / rest) if D else A, len(A)
+    hamiltonian = np.empty((2 * n, 2 * n))
+    hamiltonian[:n, :n], hamiltonian[:n, n:] = corner, B @ B.T / rest
+    hamiltonian[n:, :n], hamiltonian[n:, n:] = C.T @ C / -rest, -corner.T
+    return np.linalg.eigvals(hamiltonian).astype(np.complex128)
 
 
 def solved_beside_poles(matrices: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
@@ -133,9 +137,14 @@ def solved_beside_poles(matrices: NDArray[Any], right: NDArray[Any]) -> NDArray[
         return Vh.conj().swapaxes(1, 2) @ inner
 
 
+def log_abs(values: ComplexArray) -> FloatArray:
+    """Natural logarithms of the moduli, clipped for zero and infinity."""
+    return np.log(np.minimum(np.maximum(np.abs(values), 1e-300), 1e300))
+
+
 def log_moduli(values: ComplexArray) -> FloatArray:
-    """Natural logarithms of the moduli along the last axis, largest first; those of zero and infinity are clipped."""
-    return -np.sort(-_log(values), axis=-1)
+    """`log_abs`, the largest first along the last axis."""
+    return -np.sort(-log_abs(values), axis=-1)
 
 
 def unit_crossings(loci: Loci, points: FloatArray, *, zero: float = 0.0) -> list[UnitCrossing]:
@@ -145,7 +154,7 @@ def unit_crossings(loci: Loci, points: FloatArray, *, zero: float = 0.0) -> list
     same direction. A log modulus of at most `zero` is taken for zero.
     """
     logs = log_moduli(loci(points))
-    above = np.count_nonzero(logs > 0.0, axis=1)
+    above = (logs > 0.0).sum(axis=1)
     crossed = [(i, rank) for i, ends in enumerate(pairwise(above.tolist())) for rank in range(min(ends), max(ends))]
     if not crossed:
         return []
@@ -203,7 +212,8 @@ def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
     """+1 if the modulus of this locus falls through one at omega, -1 if it rises through one, 0 if it does neither."""
     # far above the error of a locus, far below the spacing of crossing frequencies
     step = 1e-5 * omega
-    before, after = (_log(row[np.argmin(np.abs(row - locus))]) for row in loci(np.array([omega - step, omega + step])))
+    rows = loci(np.array([omega - step, omega + step]))
+    before, after = (log_abs(row[np.argmin(np.abs(row - locus))]) for row in rows)
     return 0 if before * after >= 0.0 else int(np.sign(before))
 
 
@@ -214,25 +224,20 @@ def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list
     to the next, so all that cross at one frequency are read from one evaluation. Where the count goes up and down at
     one frequency, by rounding or because loci cross in opposite directions, each locus is followed on its own.
     """
-    places: list[list[int]] = []
-    for place in np.argsort(omega, kind="stable").tolist():
-        if places and omega[place] - omega[places[-1][-1]] <= _SAME_PLACE * omega[place]:
-            places[-1].append(place)
+    places: list[list[tuple[float, int]]] = []
+    for at, way in sorted(zip(omega.tolist(), outward.tolist(), strict=True)):
+        if places and at - places[-1][-1][0] <= _SAME_PLACE * at:
+            places[-1].append((at, way))
         else:
-            places.append([place])
-    centres = np.array([omega[place].mean() for place in places])
+            places.append([(at, way)])
+    centres = [sum(at for at, _ in place) / len(place) for place in places]
     crossings: list[UnitCrossing] = []
-    for place, centre, row in zip(places, centres.tolist(), loci(centres), strict=True):
-        from_one = np.abs(_log(row))
-        if len({*outward[place].tolist()}) == 1 and len(place) <= row.size:
+    for place, centre, row in zip(places, centres, loci(np.array(centres)), strict=True):
+        from_one, ways = np.abs(log_abs(row)), {way for _, way in place}
+        if len(ways) == 1 and len(place) <= row.size:
             nearest = row[np.argsort(from_one)[: len(place)]].tolist()
-            crossings += [UnitCrossing(centre, locus, int(outward[place[0]])) for locus in nearest]
+            crossings += [UnitCrossing(centre, locus, *ways) for locus in nearest]
         else:
             on_circle = row[from_one < _ON_CIRCLE].tolist()
             crossings += [UnitCrossing(centre, locus, slope_sign(loci, centre, locus)) for locus in on_circle]
     return crossings
-
-
-def _log(values: ComplexArray) -> FloatArray:
-    """Natural logarithms of the moduli, clipped for zero and infinity."""
-    return np.log(np.clip(np.abs(values), 1e-300, 1e300))

@@ -174,7 +174,7 @@ def unstable_roots(roots: ComplexArray, found: Sequence[Crossing], passage: Zero
                 roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega_rad_s)))
     if passage is not None:
         roots = np.delete(roots, np.argmin(np.abs(roots)))
-    return int(np.count_nonzero(roots.real > 0.0))
+    return sum(root.real > 0.0 for root in roots.tolist())
 
 
 def stability_windows(
