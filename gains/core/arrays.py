@@ -1,7 +1,5 @@
-"""Array types used in the signatures of all packages, and norms of several matrices."""
+"""Array types used in the signatures of all packages, and norms of stacks of matrices."""
 
-from collections.abc import Iterable
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -12,11 +10,6 @@ RealArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
-
-
-def norm_of(matrices: Iterable[FloatArray]) -> float:
-    """Sum of the Frobenius norms, a bound on every eigenvalue of a sum of the matrices, each turned by any phase."""
-    return sum(sqrt(np.vdot(matrix, matrix)) for matrix in matrices)
 
 
 def spectral_norms(matrices: NDArray[Any]) -> FloatArray:

@@ -18,7 +18,7 @@ from math import pi
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray, norm_of
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, is_singular_for_any_delay
 from gains.delay._crossings import (
@@ -31,7 +31,15 @@ from gains.delay._crossings import (
     polished,
     separating_points,
 )
-from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings, with_extrema
+from gains.delay._loci import (
+    Loci,
+    UnitCrossing,
+    highest_frequency,
+    norm_of,
+    solved_beside_poles,
+    unit_crossings,
+    with_extrema,
+)
 from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
 from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, without_zero, zero_passage
 

@@ -14,7 +14,7 @@ from math import inf
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray, IntArray, norm_of
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import (
     Loci,
@@ -23,6 +23,7 @@ from gains.delay._loci import (
     factor_rank,
     highest_frequency,
     log_abs,
+    norm_of,
     remembered,
     slope_sign,
     sweep_frequencies,

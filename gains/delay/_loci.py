@@ -6,16 +6,17 @@ not depend on tau. Sorted, they are continuous functions of the frequency howeve
 crossing lies between two frequencies at which different numbers of moduli exceed one.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from math import sqrt
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots, may_reach_zero, peaks
-from gains.core.arrays import ComplexArray, FloatArray, norm_of
+from gains.core.arrays import ComplexArray, FloatArray
 
 Loci = Callable[[FloatArray], ComplexArray]
 
@@ -60,6 +61,11 @@ def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     rank = sum(size > len(matrix) * _EPS * sizes[0] for size in sizes)
     root = np.sqrt(singular[:rank])
     return U[:, :rank] * root, root[:, np.newaxis] * Vh[:rank]
+
+
+def norm_of(matrices: Iterable[FloatArray]) -> float:
+    """Sum of the Frobenius norms, a bound on every eigenvalue of a sum of the matrices, each turned by any phase."""
+    return sum(sqrt(np.vdot(matrix, matrix)) for matrix in matrices)
 
 
 def highest_frequency(terms: Sequence[FloatArray]) -> float:

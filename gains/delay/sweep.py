@@ -11,10 +11,10 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray, norm_of
+from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._commensurate import circle_loci, circle_points, passes_zero
-from gains.delay._loci import delay_loci, sweep_frequencies, swept_crossings, unit_crossings
+from gains.delay._loci import delay_loci, norm_of, sweep_frequencies, swept_crossings, unit_crossings
 
 # a root of A(theta) this close to the imaginary axis, relative to the norm, is on it
 _ON_AXIS = 1e-9
