@@ -65,7 +65,7 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
         raise BadModelError(f"{name} has shape {matrix.shape}; a matrix with at least one row and column is wanted")
     if not np.isfinite(matrix).all():
         raise BadModelError(f"{name} has entries that are not finite; finite numbers are wanted")
-    return matrix.astype(np.float64, copy=False)
+    return matrix.astype(np.float64)  # a copy: the caller may change what it passed
 
 
 def positive_seconds(name: str, value: float) -> float:

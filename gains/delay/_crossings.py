@@ -99,7 +99,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
 
 
 def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, places: ComplexArray) -> list[Crossing]:
-    """All crossings of one block, touches included; each is near one of the complex numbers `places`."""
+    """All crossings of one block, touches included; near each, on the imaginary axis, is one of the `places`."""
     highest = highest_frequency(terms)
     candidates = _near_axis(places, highest)
     points = separating_points(candidates, highest)

@@ -121,6 +121,7 @@ def first_critical_delay_s(blocks: Sequence[BlockAnalysis]) -> float:
     leaving = any(crossing.delay_s == 0.0 and crossing.direction > 0 for crossing in crossings)
     if leaving or any(block.fixed_on_axis or block.unstable > 0 for block in blocks):
         return 0.0
+    # a root that leaves to the left without delay crosses again a period later
     return min((crossing.delay_s or 2.0 * pi / crossing.omega_rad_s for crossing in crossings), default=inf)
 
 

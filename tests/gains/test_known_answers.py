@@ -5,7 +5,7 @@ import pytest
 
 from gains.core._bracketing import highest
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.core.structure import is_singular_for_any_delay
+from gains.core.structure import is_singular_for_any_delay, real_matrix
 from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null, polished
 from gains.delay._loci import UnitCrossing, remembered
 from gains.delay._mixed import count_unstable_roots
@@ -127,3 +127,10 @@ def test_other_roots_are_counted_beside_one_that_stays_at_zero(
     terms: list[tuple[list[list[float]], float]], unstable: int
 ) -> None:
     assert count_unstable_roots(terms, leave_out_zero=True) == unstable
+
+
+def test_a_matrix_that_was_passed_may_be_changed_afterwards() -> None:
+    passed = np.eye(2)
+    kept = real_matrix("A", passed)
+    passed[0, 0] = 5.0
+    assert kept.tolist() == [[1.0, 0.0], [0.0, 1.0]]

@@ -1,14 +1,17 @@
 """Scenario files: what is accepted, and that everything else is refused in one line that says why."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+import tomlkit
 from pydantic import ValidationError
 
 from gains.core.requirement import ALPHA_MIN, DELAY_MARGIN_MAX_S, Requirement
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, dump, fingerprint, load, parse
+from scenarios.link_files import toml_text
 from scenarios.schema import Control, Scenario
 from scenarios.shipped import columns
 from tests.support.paths import SCENARIOS
@@ -296,3 +299,10 @@ def test_copters_take_off_to_an_altitude_that_they_are_given_and_reach(line: str
     text = (SCENARIOS / "copters5.toml").read_text()
     with pytest.raises(ScenarioError, match=f"altitude_m: read {read}, wanted {wanted}"):
         parse(text.replace("altitude_m = 20.0", line, 1), FILE)
+
+
+def test_lists_made_whole_are_written_as_tomlkit_writes_them() -> None:
+    table = {"trace_s": [0.1, 2e-7, 3.0], "none": [], "rows": [[1, 2], [3, 4]], "names": ['a"b', "c"], "flags": [True]}
+    data = {**table, "part": table, "parts": [table, {"x": 1}]}
+    assert toml_text(data) == tomlkit.dumps(data)
+    assert tomllib.loads(toml_text(data)) == data
