@@ -37,7 +37,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     ),
     "lint": (
         "check format, style, types and import contracts",
-        ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],
+        ["ruff format --check .", "ruff check .", "pyrefly check", "lint-imports"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
     "pictures": (

@@ -49,7 +49,7 @@ def at_row(run: Callable[Concatenate[Record, P], T]) -> Callable[Concatenate[Rec
     Each is a copy of `_at_row` whose global `_run` is its kernel, as the compiler knows kernels only as globals.
     """
     inner: Any = run
-    outer = FunctionType(_at_row.__code__, {"_run": run}, "_at_row")
+    outer: Any = FunctionType(_at_row.__code__, {"_run": run}, "_at_row")
     outer.__module__, _, name = inner._name.rpartition(".")
     outer.__qualname__ = f"{name}_at"
     return kernel(outer)
@@ -152,7 +152,7 @@ class _Kernel:
             left += [called for called in one._called() if called._name not in reached]
             for name in function.__code__.co_names:
                 value = function.__globals__.get(name)
-                if isinstance(value, bool | int | float | tuple):
+                if isinstance(value, (bool, int, float, tuple)):
                     reached[f"{function.__module__}.{name}"] = repr(value).encode()
         parts = [self._name.encode(), *(name.encode() + reached[name] for name in sorted(reached))]
         return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]

@@ -62,7 +62,7 @@ def toml_text(data: Mapping[str, Any]) -> str:
             return {key: whole(value) for key, value in part.items()}
         if not isinstance(part, list):
             return part
-        if not part or any(isinstance(value, dict | list) for value in part):
+        if not part or any(isinstance(value, (dict, list)) for value in part):
             return [whole(value) for value in part]
         items: list[Any] = [item for value in part for item in (Whitespace(", "), tomlkit.item(value))]
         return Array(items[1:], Trivia())

@@ -262,7 +262,8 @@ def nearly_null(M: ComplexArray, scale: float) -> tuple[float, ComplexArray, Com
         inverse = np.array(np.linalg.inv(bordered), dtype=np.complex128)
     except np.linalg.LinAlgError:
         inverse = np.full_like(bordered, np.inf)
-    u, v = inverse[n, :n].conj(), inverse[:n, n]
+    u: ComplexArray = inverse[n, :n].conj()
+    v: ComplexArray = inverse[:n, n]
     sizes = float(np.linalg.norm(u)), float(np.linalg.norm(v))
     if _TOGETHER * scale * float(np.linalg.norm(inverse)) < 1.0:
         return abs(complex(inverse[n, n])) / (sizes[0] * sizes[1]), (u / sizes[0])[:, None], (v / sizes[1])[:, None]

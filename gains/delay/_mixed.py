@@ -103,7 +103,8 @@ class _Parts:
 
     def sum_at(self, omega: FloatArray) -> ComplexArray:
         """The sum of all A_i e^{-j omega d_i}, shape (frequencies, n, n)."""
-        return np.tensordot(np.exp(-1j * np.outer(omega, self.known_s)), self.matrices, axes=1)
+        turned = np.exp(-1j * np.outer(omega, self.known_s))
+        return np.asarray(np.tensordot(turned, self.matrices, axes=1), np.complex128)
 
     def highest(self) -> float:
         """Bound (rad/s) on every root on the imaginary axis, from spectral norms."""

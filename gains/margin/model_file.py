@@ -92,7 +92,7 @@ def parse_model(text: str) -> DelayModel | HeldModel:
     >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
     ('tau', 0.1, Fraction(2, 1))
     """
-    if not isinstance(text, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not isinstance(text, str):
         raise BadModelError(f"the model: read {type(text).__name__}, wanted JSON as a string")
     data = _parsed(text)
     if not isinstance(data, dict):

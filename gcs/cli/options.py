@@ -277,7 +277,7 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
         wanted = "wanted one: another station knows vehicles by their ids in frames"
         raise InputError(f"--mirror: read vehicles in the networks {' '.join(map(str, link.networks))}, {wanted}")
     with usable(f"--mirror: {text}", "the address of a ground station"):
-        mirror = Mirror(host, port, commands=commands, signed=link.guard and link.guard.mirror_link)
+        mirror = Mirror(host, port, commands=commands, signed=None if link.guard is None else link.guard.mirror_link)
     (to_host, to_port), (own_host, own_port) = mirror.address, link.address
     here = to_host == own_host or (ip_address(own_host).is_unspecified and ip_address(to_host).is_loopback)
     if here and to_port == own_port:

@@ -55,7 +55,7 @@ class StateHistory:
         """A ring buffer for each vehicle."""
         self.counts = np.zeros(vehicles, np.int64)
         """Number of reports accepted from each vehicle."""
-        self._times_ns, self._states = memoryview(self.reports["time_ns"]), memoryview(self.reports["state"])
+        self._times_ns, self._states = self.reports["time_ns"].data, self.reports["state"].data
 
     def add(self, vehicle: int, time_ns: int, state: State) -> bool:
         """Add a report; returns False if it is not newer than the newest, and ignores it."""

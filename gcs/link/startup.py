@@ -101,6 +101,9 @@ class LaunchedStartup(Startup):
             self._upload.take(fields)
             self.refusal = self._upload.refusal
 
+    def disarmed(self) -> None:
+        """It may be armed again."""
+
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
         if self.stranger:
             return Step(self.refusal or _STRANGER)

@@ -169,7 +169,7 @@ def result_of(
         failure=failure,
         passed=not failure and not failed,
         trials=len(outcomes),
-        trials_of_kind=dict(Counter(outcome.kind for outcome in outcomes)),
+        trials_of_kind=dict(Counter[str](outcome.kind for outcome in outcomes)),
         trials_failed=failed,
         worst=tuple(outcome.id for outcome in worst_of(outcomes)),
         flight_time_s=round(sum(outcome.elapsed_s for outcome in outcomes), 3),

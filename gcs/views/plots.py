@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core.arrays import FloatArray
 from gains.delay.constant import analyse_delay
 from gains.delay.rightmost import rightmost_root, rightmost_roots
 
 
-def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None) -> Any:
+def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float] | FloatArray, axes: Any = None) -> Any:
     """Plot the real part (1/s) of the rightmost root against delay; stable windows are shaded, the margin is the title.
 
     Raises what `gains.analyse_delay` and `gains.rightmost_root` raise.
@@ -32,7 +33,7 @@ def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: A
 
 
 def plot_root_locus(
-    A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None, *, roots: int = 4
+    A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float] | FloatArray, axes: Any = None, *, roots: int = 4
 ) -> Any:
     """Plot the `roots` rightmost roots with imaginary part >= 0 at each delay, coloured by delay; crossings are ringed.
 

@@ -120,7 +120,7 @@ class Link:
         self._columns = self._queues.columns
         self._long: dict[tuple[int, int], bytes] = {}
         """Datagrams longer than a frame, by (number, DUPLICATE or 0)."""
-        self._stream = None
+        self._stream: Stream | None = None
         if channel is not None or not constant(link):
             self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
             self._made = 0

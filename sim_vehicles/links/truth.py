@@ -82,7 +82,7 @@ class Recorder:
 
     def __init__(self, write: Callable[[Records], object], batch: int = _BATCH) -> None:
         self.rows: Records = np.zeros(1 + batch, DTYPE)
-        self._counts = memoryview(self.rows["queued_ns"])
+        self._counts = self.rows["queued_ns"].data
         self._write = write
 
     def add(self, row: Row) -> None:

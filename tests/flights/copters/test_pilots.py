@@ -188,7 +188,7 @@ def test_an_abandoned_flight_leaves_its_vehicles_holding(flavour: str) -> None:
     now_ns = station.next_event_ns
     pilots.step([(address, frame, now_ns) for frame, address in station.abandoned()], now_ns)
     pilots.step([], now_ns + SECOND)
-    modes = {system_id: pilots.fleet.vehicle(system_id).craft.mode for system_id in (1, 2, 3)}  # pyright: ignore[reportAttributeAccessIssue]
+    modes = {system_id: pilots.fleet.vehicle(system_id).craft.mode for system_id in (1, 2, 3)}  # pyrefly: ignore[missing-attribute]
     assert modes == {1: RULES[flavour].hold_mode, 2: RULES[flavour].hold_mode, 3: mode}
 
 

@@ -1,5 +1,6 @@
 """Flights of formations that manoeuvre, in virtual time with given gains."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -144,7 +145,7 @@ class Sniffed:
 
     def step(self, received: Sent, now_ns: int) -> Sent:
         for system_id, data, _ in received:
-            self.sent.setdefault(system_id, []).extend(mavlink.decode(data, {}))  # pyright: ignore[reportArgumentType]
+            self.sent.setdefault(system_id, []).extend(mavlink.decode(data, Counter()))
         return self._vehicles.step(received, now_ns)
 
 

@@ -256,7 +256,7 @@ def test_ticks_of_the_opened_formation_keep_the_wider_spacing() -> None:
     station = Station(plan, start_ns=START_NS)
     rows: list[TickArray] = []
     for ticks in fly_lockstep(plan, station=station):
-        station._monitor.opening = 1.5  # pyright: ignore[reportPrivateUsage]
+        station._monitor.opening = 1.5  # noqa: SLF001
         rows.append(ticks)
     last = rows[-60]
     gap = np.hypot(last["north_m"][1] - last["north_m"][0], last["east_m"][1] - last["east_m"][0])

@@ -1,5 +1,6 @@
 """Loops whose vehicles have margins of their own: over links that differ, and where a leader hears nobody."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from scenarios.schema import Scenario
 from tests.support.known import known
 
 
-def chain(blocks: dict[tuple[int, int], tuple[float, ...]], **control: object) -> Scenario:
+def chain(blocks: Mapping[tuple[int, int], tuple[float, ...]], **control: object) -> Scenario:
     """Three vehicles, each behind another; u_i has the gains (of spacing and velocity, alike north and east) on e_j."""
     vehicles = [
         f"{{ system_id = {k}, position_ne_m = [{-61 * (k - 1)}, {9.7 * (k - 1)}], velocity_ne_m_s = [20, 0]"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks
-from gains.delay._commensurate import _roots_and_slopes  # pyright: ignore[reportPrivateUsage]
+from gains.delay._commensurate import _roots_and_slopes
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed_block
 from gains.delay._windows import DelayAnalysis, combined_analysis

@@ -62,4 +62,4 @@ def test_ratios_are_against_inclusion_of_five_vehicles() -> None:
 
 def test_weights_may_be_nested_lists() -> None:
     plant = Plant([[0.0]], [[1.0]])
-    assert centralised_lqr(plant, Weights([[4.0]], [[1.0]]))[0] == pytest.approx(np.array([[-2.0]]))  # pyright: ignore[reportArgumentType]
+    assert centralised_lqr(plant, Weights([[4.0]], [[1.0]]))[0] == pytest.approx(np.array([[-2.0]]))  # pyrefly: ignore[bad-argument-type]

@@ -89,7 +89,7 @@ def test_negative_k1_and_positive_k3_stabilise() -> None:
 
 
 def test_an_array_is_taken_as_well_as_a_tuple() -> None:
-    assert FormationModel(np.array([-1, 0, 1])) == FormationModel((-1, 0, 1))  # pyright: ignore[reportArgumentType]
+    assert FormationModel(np.array([-1, 0, 1])) == FormationModel((-1, 0, 1))  # pyrefly: ignore[bad-argument-type]
 
 
 @pytest.mark.parametrize(

@@ -146,4 +146,4 @@ def test_two_hundred_vehicles_are_verified_with_sparse_matrices() -> None:
 
 def test_restriction_of_another_type_is_refused() -> None:
     with pytest.raises(BadModelError, match="'c'"):
-        expand(FormationModel((-1, 0)), "c")  # pyright: ignore[reportArgumentType]
+        expand(FormationModel((-1, 0)), "c")  # pyrefly: ignore[bad-argument-type]

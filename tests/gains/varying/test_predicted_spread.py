@@ -13,7 +13,7 @@ from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window
 from gains.varying.predicted import (
     PredictedSpread,
-    _gain,  # pyright: ignore[reportPrivateUsage] - the lemma on which the proof rests
+    _gain,  # the lemma on which the proof rests
 )
 
 PERIOD_S, K1, K3 = 0.02, 3.408, 5.608

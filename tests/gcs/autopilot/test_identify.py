@@ -1,6 +1,7 @@
 """Responses found from the manoeuvre against the ones that were simulated."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,16 +33,14 @@ MODELS = [
 ]
 
 
-def flown(
-    response: Response, rate_hz: float, *, noise_m_s: float = 0.0, square: bool = False, **limits: float
-) -> Flown:
+def flown(response: Response, rate_hz: float, *, noise_m_s: float = 0.0, square: bool = False, **limits: Any) -> Flown:
     """The manoeuvre of a simulated copter, which shares no code with the identification."""
     autopilot = Autopilot(
         lag_s=response.lag_s,
         velocity_gain_1_s=response.velocity_gain_1_s,
         dead_time_s=response.dead_time_s,
         natural_frequency_rad_s=response.natural_frequency_rad_s,
-        **limits,  # pyright: ignore[reportArgumentType]
+        **limits,
     )
     motion, velocity, sample_s = Motion(0j, inner=inner_of(autopilot)), 0j, np.arange(FIRST_S, 6.0, 1 / rate_hz)
     commands, velocities = list[float](), list[float]()

@@ -42,7 +42,7 @@ def tapped(plan: FlightPlan, *, opening: float | None = None) -> Wiretap:
     station, tap = Station(plan, start_ns=START_NS), Wiretap(Fleet(plan.scenario, START_NS))
     for _ in fly_lockstep(plan, station=station, vehicles=tap):
         if opening is not None:
-            station._monitor.opening = opening  # pyright: ignore[reportPrivateUsage]
+            station._monitor.opening = opening  # noqa: SLF001
     return tap
 
 

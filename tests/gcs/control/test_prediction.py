@@ -80,7 +80,7 @@ def test_without_set_points_a_vehicle_holds_velocity_after_the_timeout() -> None
 def test_forgetting_set_points_older_than_any_prediction_changes_nothing() -> None:
     commands: Commands = [(START + 20 * MS * k, (np.sin(0.01 * k), 1.0)) for k in range(6000)]
     history, now_ns = history_of(commands), commands[-1][0]
-    remembered = len(history._due_ns)  # pyright: ignore[reportPrivateUsage] - what it forgets shows nowhere else
+    remembered = len(history._due_ns)  # noqa: SLF001 - what it forgets shows nowhere else
     assert remembered < 2 * KEPT_S * 50 + 2
     since_ns = now_ns - 3 * S
     found = carried(history, STATE, since_ns, now_ns)

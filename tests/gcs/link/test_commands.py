@@ -1,5 +1,7 @@
 """Commands and their answers, which do not say what they answer."""
 
+from collections import Counter
+
 from gcs.link import mavlink
 from gcs.link.clocks import LEAST_SAMPLES
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, SET_MODE, Goal
@@ -13,7 +15,7 @@ ACCEPTED = (SET_MESSAGE_INTERVAL, 0, 0, 0, 0, 0)
 def requested(frame: bytes | None) -> float:
     """The message whose rate a frame asks for."""
     assert frame is not None
-    [parsed] = mavlink.decode(frame, {})  # pyright: ignore[reportArgumentType] - nothing is refused
+    [parsed] = mavlink.decode(frame, Counter())
     assert parsed.msg_id == mavlink.COMMAND_LONG
     return parsed.fields[0]
 
@@ -78,7 +80,7 @@ def stranger() -> tuple[RemoteVehicle, list[int]]:
     for k in range(400):
         vehicle.heard_ns = k * NS_PER_S // 20
         if (frame := vehicle.next_frame(k * NS_PER_S // 20)) is not None:
-            sent += [parsed.msg_id for parsed in mavlink.decode(frame, {})]  # pyright: ignore[reportArgumentType]
+            sent += [parsed.msg_id for parsed in mavlink.decode(frame, Counter())]
     return vehicle, sent
 
 

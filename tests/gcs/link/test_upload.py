@@ -1,6 +1,7 @@
 """Parameters for a vehicle: whatever the link does to them, done means that the vehicle has them."""
 
 import struct
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -19,8 +20,8 @@ class Holder:
     def __init__(self) -> None:
         self.values = dict.fromkeys(NUMBERS, 0.0)
 
-    def answer(self, msg_id: int, fields: tuple[object, ...]) -> tuple[object, ...]:
-        name = bytes(fields[3]).decode()  # pyright: ignore[reportArgumentType]
+    def answer(self, msg_id: int, fields: tuple[Any, ...]) -> tuple[object, ...]:
+        name = bytes(fields[3]).decode()
         if msg_id == mavlink.PARAM_SET:
             self.values[name] = struct.unpack("<f", struct.pack("<f", fields[0]))[0]
         return self.values[name], 3, 0, name.encode().ljust(16, b"\0"), 9

@@ -34,7 +34,7 @@ def test_a_design_read_back_from_its_run_is_the_same(scenario: Scenario, tmp_pat
 
 def test_a_design_cannot_be_changed() -> None:
     with pytest.raises(ValidationError, match="frozen"):
-        Design(delay_margin_s=0.3).alpha = 1.0  # pyright: ignore[reportAttributeAccessIssue]
+        Design(delay_margin_s=0.3).alpha = 1.0  # pyrefly: ignore[read-only]
 
 
 def test_endless_margins_are_none_and_missing_parts_are_not_written() -> None:

@@ -1,6 +1,7 @@
 """The monitor: every row of its transition table, and that a change of gains does not jump."""
 
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from gcs.control.tick import Mode
 from gcs.station.modes import STATE, Observation, VehicleState, next_state, policy_of
-from gcs.station.monitor import FormationMonitor, Seen, _judged_delay_s  # pyright: ignore[reportPrivateUsage]
+from gcs.station.monitor import FormationMonitor, Seen, _judged_delay_s
 from scenarios.kernel import at_row
 from scenarios.schema import Monitor
 
@@ -36,7 +37,7 @@ def with_headroom(headroom: float, gain_set: int = 0) -> float:
     return (1 - headroom) * MARGINS_S[gain_set]
 
 
-def after(state: VehicleState, *, seconds: float = 0.0, policy: Monitor = POLICY, **seen: object) -> VehicleState:
+def after(state: VehicleState, *, seconds: float = 0.0, policy: Monitor = POLICY, **seen: Any) -> VehicleState:
     """The state after the same observation at each tick (50 Hz) of a time; one tick if no time is given."""
     for k in range(max(1, round(seconds * 50) + 1)):
         state = monitored(state, SEEN._replace(**seen, time_s=100.0 + 0.02 * k), MARGINS_S, policy)

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import pytest
 import typer
-from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes with pymavlink, untyped
+from lxml import etree  # it comes with pymavlink, untyped
 from typer.testing import CliRunner
 
 from gcs.cli.results import checks_of
@@ -260,9 +260,8 @@ def test_failed_trials_are_errors_in_junit(tmp_path: Path) -> None:
     failed = Outcome(
         id="abc", kind="own", seed=3, coordinates={"delay": 0.1}, real_time=False, error="Traceback\nValueError: no"
     )
-    result = CampaignResult.model_construct(
-        scenario="pair", flight_time_s=1.0, failure="", assert_onset=None, trials_failed=(failed,)
-    )
+    known: dict[str, Any] = {"scenario": "pair", "flight_time_s": 1.0, "failure": "", "assert_onset": None}
+    result = CampaignResult.model_construct(**known, trials_failed=(failed,))
     write_junit(tmp_path / "junit.xml", "gcs stress pair", checks_of(result), time_s=1.0)
     suite = ElementTree.parse(tmp_path / "junit.xml").getroot()
     assert junit_counts(tmp_path / "junit.xml") == {"tests": 2, "failures": 0, "errors": 1, "skipped": 1}

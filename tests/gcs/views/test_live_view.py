@@ -26,7 +26,7 @@ needs_vulkan = pytest.mark.skipif(viewer.vulkan_missing(), reason="no Vulkan dri
 @contextmanager
 def headless(folder: Path) -> Generator[str]:
     """HOST:PORT of a viewer without a window."""
-    program = viewer._program()  # pyright: ignore[reportPrivateUsage]
+    program = viewer._program()  # noqa: SLF001
     log = folder / "viewer.log"
     with log.open("wb") as out:
         process = subprocess.Popen(

@@ -47,7 +47,7 @@ class PilotsVehicle:
             self.reached_ns = self.reached_ns or now_ns + 3 * SECOND // 2
         if 0 < self.reached_ns < now_ns:
             self.told += [parse(data) for system_id, data, _ in received if system_id == 3]
-        sent: Sent = []
+        sent: list[tuple[int, bytes, int]] = []
         for system_id, data, time_ns in self.fleet.step(received, now_ns):
             kept = self.change(data, time_ns) if system_id == 3 else [(data, time_ns)]
             sent += [(system_id, each, at_ns) for each, at_ns in kept]
