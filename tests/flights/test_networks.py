@@ -111,7 +111,10 @@ def test_the_benchmarks_formation_fills_one_network_after_the_other() -> None:
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        ("fly networks.toml --mirror 127.0.0.1:9", "--mirror: read vehicles in the networks 0 1 9, wanted one"),
+        (
+            "fly networks.toml --listen 127.0.0.1:0 --mirror 127.0.0.1:9",
+            "--mirror: read vehicles in the networks 0 1 9, wanted one",
+        ),
         ("fly networks.toml --listen 127.0.0.1:65530", "there is no port 65539 for network 9, wanted free UDP ports"),
         (
             "replay flight-1.tlog networks.toml",
