@@ -76,7 +76,7 @@ def install() -> None:
         print(f"making {VENV}", flush=True)
         if subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=False).returncode != 0:
             sys.exit("python could not make a virtual environment; on Debian and Ubuntu: apt install python3-venv")
-    print("installing the locked packages (a minute the first time)", flush=True)
+    print("installing the locked packages (half a minute the first time)", flush=True)
     pip = [str(python), "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
     locked = ["--require-hashes", "-r", str(LOCK)]
     if not _installed_by_uv(python, pip, locked):  # it does not read the settings of pip, such as its index
@@ -99,7 +99,7 @@ def _installed_by_uv(python: Path, pip: list[str], locked: list[str]) -> bool:
     own = [*pip, "--require-hashes", "-r", "/dev/stdin"]
     if pinned is None or subprocess.run(own, input=pinned[0], text=True, check=False).returncode != 0:
         return False
-    install = [str(VENV / "bin" / "uv"), "pip", "install", "--quiet", "--compile-bytecode", "--python", str(python)]
+    install = [str(VENV / "bin" / "uv"), "pip", "install", "--quiet", "--python", str(python)]
     return subprocess.run([*install, *locked], check=False).returncode == 0
 
 
@@ -111,6 +111,7 @@ def main() -> None:
     for name, (text, _) in JOBS.items():
         jobs.add_parser(name, help=text)
     chosen, further = parser.parse_known_args()
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command would compile what it imports anew
     try:
         with Path(__file__).open() as own:
             fcntl.flock(own, fcntl.LOCK_EX)  # of several jobs at once, the first installs
