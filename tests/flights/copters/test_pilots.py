@@ -121,6 +121,7 @@ def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_th
     assert_left_alone(pilots, mode)
 
 
+@pytest.mark.slow(first=4)
 @pytest.mark.parametrize("mode", [POSCTL, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24, 4 << 16 | 3 << 24])
 @pytest.mark.parametrize("at_s", [5.0, 6.0])
 def test_a_px4_pilot_intervening_before_first_offboard_is_left_alone(mode: int, at_s: float) -> None:

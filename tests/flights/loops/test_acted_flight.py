@@ -71,6 +71,7 @@ def copters(flavour: str) -> Scenario:
     return stepped(base, SLOW, link_s=0.1, step_m_s=1.5)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize(
     ("make", "share"),
     [(launched, 0.99), (lambda: copters("ardupilot"), 0.85), (lambda: copters("px4"), 0.85)],

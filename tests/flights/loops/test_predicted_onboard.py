@@ -64,6 +64,7 @@ def test_the_window_is_that_of_the_own_loops_step_by_step() -> None:
     assert max(radius(least_s + aside_s), radius(most_s - aside_s)) < 1.0 < min(outside)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("loop_s", [0.75, 1.3, 1.37])
 def test_errors_change_at_the_rate_of_the_certificate(loop_s: float) -> None:
     outcome = fly_trial(Study(planned(1.0)).trial("probe", {"delay": loop_s - 0.01}, seed=1))

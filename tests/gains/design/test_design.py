@@ -138,6 +138,7 @@ def test_decay_rate_is_refused_only_where_no_gains_have_it() -> None:
         design(TRIANGLE, Requirement(delay_margin_s=0.57, decay_rate_1_s=1.2), period_s=PERIOD_S)
 
 
+@pytest.mark.slow(first=4)
 @pytest.mark.parametrize(
     "wanted",
     [

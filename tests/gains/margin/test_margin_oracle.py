@@ -138,6 +138,7 @@ def test_integrators_in_any_unimodular_coordinates_have_a_margin(group: int) -> 
         assert found.delay_margin_s > 0.0 or seed % 3 == 2, seed
 
 
+@pytest.mark.slow(first=9)
 @pytest.mark.parametrize("family", [integrators, consensus, random_loop], ids=lambda family: family.__name__)
 @pytest.mark.parametrize("group", range(GROUPS))
 def test_windows_are_those_of_the_argument_principle(family: Any, group: int) -> None:

@@ -110,14 +110,15 @@ def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
     assert summary["headroom_min"] < 0
 
 
+@pytest.mark.slow(first=3)
 @pytest.mark.parametrize(
     ("early", "number"),
     [
         (True, signal.SIGINT),
-        (False, signal.SIGINT),
         (False, signal.SIGTERM),
-        (True, signal.SIGHUP),
         (False, signal.SIGHUP),
+        (False, signal.SIGINT),
+        (True, signal.SIGHUP),
     ],
 )
 def test_ctrl_c_sigterm_and_hangup_leave_whole_files_without_traceback(

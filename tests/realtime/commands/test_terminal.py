@@ -56,6 +56,7 @@ def test_the_flight_table_stands_until_ctrl_c_restores_the_shell(kind: str, tmp_
         assert is_restored(shown)
 
 
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("columns", "lines"), [(60, 24), (40, 20)])
 def test_a_narrow_terminal_shows_each_vehicles_headroom_and_mode(
