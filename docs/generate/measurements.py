@@ -34,9 +34,12 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "quick": (figures.design, figures.margin_held, figures.margin_thesis, figures.readme_onset),
     "exact": (
         *(figures.onset_chain3, figures.string_limit, figures.compare, figures.prediction_windows),
-        *(figures.prediction_price, figures.prediction_flights, figures.thesis_flights),
+        *(figures.prediction_price, figures.prediction_flights),
     ),
-    "slow": (figures.onsets, figures.one_link, figures.maps, figures.capacity, figures.copters_onset),
+    "slow": (
+        *(figures.onsets, figures.one_link, figures.maps, figures.capacity, figures.copters_onset),
+        figures.thesis_flights,  # the tests fly the same
+    ),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
         *(figures.signing, figures.design_time, figures.speed, figures.map_speed, figures.onset_real_time),
