@@ -7,7 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core._bracketing import highest
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.structure import roots_of
 from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.constant import analyse_delay, delay_margin
@@ -136,6 +137,11 @@ class LoopFigures(DelayFreeFigures):
         own_s, late_s = self.timing.delays_s(self.delay_s)
         return -rightmost_root([(A, 0.0), (B @ own, own_s), (B @ (K - own), late_s)]).real
 
+    @property
+    def is_stable_at_delay(self) -> bool:
+        """Whether the loop is stable at the delay."""
+        return self.decay_rate_at_delay_1_s > 0.0
+
     @cached_property
     def alpha_at_delay(self) -> float:
         """α at the delay; 0 if the loop is unstable there."""
@@ -147,7 +153,22 @@ class LoopFigures(DelayFreeFigures):
             loop = formation_loop(self.model, self.K, self.responses)
             flown = DisturbedFormation(self.model, *loop, self.timing.period_s, self.delay_s)
             return SectorLoop(flown, tuple(range(self.model.states)), self.W).complex_radius().radius_1_s
-        return 1.0 / peak_gain(self._characteristic, np.eye(self.model.states), self.W, self._frequencies)
+        return 1.0 / highest(self._sensitivity, self._frequencies, self._scanned)[1]
+
+    @cached_property
+    def alpha_at_delay_most(self) -> float:
+        """An upper bound on α at the delay, quick to compute; exact without delay."""
+        if self.delay_s is None or self.discrete:
+            return self.alpha_at_delay
+        return 1.0 / float(self._scanned.max())
+
+    @cached_property
+    def _scanned(self) -> FloatArray:
+        return self._sensitivity(self._frequencies)
+
+    def _sensitivity(self, omega: FloatArray) -> FloatArray:
+        """The largest gain from disturbances of the states to weighted errors at each frequency."""
+        return spectral_norms(self.W @ np.linalg.inv(self._characteristic(omega)))
 
     @cached_property
     def spacing_gain_max_s2(self) -> float:

@@ -148,15 +148,26 @@ class PredictedFigures(DelayFreeFigures):
 
         return min(map(decay, self.delays_s))
 
-    @cached_property
+    @property
+    def is_stable_at_delay(self) -> bool:
+        """Whether the loop is stable at every true delay."""
+        return self.decay_rate_at_delay_1_s > 0.0
+
+    @property
     def alpha_at_delay(self) -> float:
         """The complex stability radius, as in `gains.performance.flown`; 0 if the loop is unstable."""
-        heavy, states = self.W, np.eye(self.model.states)
-        return 1.0 / gain if (gain := self._peak(heavy, states)) < inf else 0.0
+        return self.alpha_at_delay_most if self.is_stable_at_delay else 0.0
+
+    @cached_property
+    def alpha_at_delay_most(self) -> float:
+        """α at the delay, if the loop is stable."""
+        return 1.0 / self._peak(self.W, np.eye(self.model.states))
 
     @cached_property
     def spacing_gain_max_s2(self) -> float:
         """H-infinity gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable."""
+        if not self.is_stable_at_delay:
+            return inf
         rows = self.model.spacing_mask
         return self._peak(np.eye(self.model.states)[rows], self.model.B) if rows.any() else 0.0
 
@@ -200,8 +211,6 @@ class PredictedFigures(DelayFreeFigures):
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
         """Largest gain from disturbances that enter through `entry` to the outputs `out` of the errors."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
-            return inf
         (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
         K = self._fed_forward
 
