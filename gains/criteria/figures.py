@@ -139,7 +139,10 @@ class LoopFigures(DelayFreeFigures):
 
     @property
     def is_stable_at_delay(self) -> bool:
-        """Whether the loop is stable at the delay."""
+        """Whether the loop is stable at the delay; in searches by its margin if that is known already."""
+        if self.thinned > 1 and not self.discrete and self.timing.loop == "ground":
+            if vars(self).get("delay_margin_s", 0.0) > (self.delay_s or 0.0):
+                return True
         return self.decay_rate_at_delay_1_s > 0.0
 
     @cached_property
@@ -147,7 +150,7 @@ class LoopFigures(DelayFreeFigures):
         """α at the delay; 0 if the loop is unstable there."""
         if self.delay_s is None:
             return self.alpha
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return 0.0
         if self.discrete:
             loop = formation_loop(self.model, self.K, self.responses)
@@ -173,7 +176,7 @@ class LoopFigures(DelayFreeFigures):
     @cached_property
     def spacing_gain_max_s2(self) -> float:
         """H∞ gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable, 0 for one vehicle."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         if self.model.vehicles == 1:
             return 0.0
@@ -183,7 +186,7 @@ class LoopFigures(DelayFreeFigures):
     @cached_property
     def noise_gain_max(self) -> float:
         """H2 gain from measurement noise to the noisiest command, in the ground loop; `inf` if it is unstable."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         loop = formation_loop(self.model, self.K, self.responses)
         return noise_gain(*loop, period_s=self.timing.period_s, delay_s=self.delay_s or 0.0)

@@ -27,6 +27,7 @@ For disturbances the loop is continuous, R = (s I - A)^{-1}, and a hold counts a
 sampled loop.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, pi
@@ -110,7 +111,7 @@ class PredictedFigures(DelayFreeFigures):
     @cached_property
     def window_s(self) -> tuple[float, float]:
         """The least and the largest stable true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
-        if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
+        if not self._is_rough:
             timing = Timing(self.period_s, self.period_s)
             return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
         half_s = self.period_s / 2.0
@@ -150,8 +151,16 @@ class PredictedFigures(DelayFreeFigures):
 
     @property
     def is_stable_at_delay(self) -> bool:
-        """Whether the loop is stable at every true delay."""
+        """Whether the loop is stable at every true delay; in searches also by the window."""
+        if self._is_rough and self.decay_rate_1_s > 0.0 and self.delays_s != (self.assumed_s,):
+            if self.window_s[0] < min(self.delays_s) and max(self.delays_s) < self.window_s[1]:
+                return True
         return self.decay_rate_at_delay_1_s > 0.0
+
+    @property
+    def _is_rough(self) -> bool:
+        """Whether the window is that of the continuous loop."""
+        return self.thinned > 1 and self.assumed_s >= _SHORT * self.period_s
 
     @property
     def alpha_at_delay(self) -> float:
@@ -188,23 +197,27 @@ class PredictedFigures(DelayFreeFigures):
         """Largest growth of a commanded motion from vehicle to vehicle; 1 if there is no chain."""
         if not self.chain:
             return 1.0
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         omega = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)[:: self.thinned]
-        return max(1.0, *(self._largest(lambda at, s=s: self.growth(at, s), omega) for s in self.delays_s))
+        return max(1.0, self._largest(lambda at: self.growth(at, *self.delays_s), omega))
 
-    def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
-        """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`."""
+    def growth(self, omega: FloatArray, *delays_s: float) -> FloatArray:
+        """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`.
+
+        The largest over the true delays.
+        """
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
-        front, own = (self._loop[2][1] @ self._seen(z, delay_s)).T
-        return np.abs((self.feed_forward + front) / (1.0 - own))
+        front, own = np.array(self._seen(self._loop[2][1:2], z, delays_s))[:, :, 0].T
+        return np.abs((self.feed_forward + front) / (1.0 - own)).max(axis=1)
 
-    def _seen(self, z: ComplexArray, delay_s: float) -> ComplexArray:
-        """S of the module's docstring, at points z (k, 1, 1)."""
+    def _seen(self, K: FloatArray, z: ComplexArray, delays_s: Sequence[float]) -> list[ComplexArray]:
+        """K S of the module's docstring at each true delay, at points z (k, 1, 1)."""
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-        R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
-        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
-        return R @ G + self._ahead @ R @ mismatch
+        both = np.vstack([K, K @ self._ahead]).T.astype(np.complex128)
+        at_once, ahead = np.split(np.linalg.solve(z * np.eye(len(Phi)) - Phi.T, both).swapaxes(1, 2), 2, axis=1)
+        assumed, answer = held_entry(self._plant, z, self.assumed_s), at_once @ G
+        return [answer + ahead @ (held_entry(self._plant, z, delay_s) - assumed) for delay_s in delays_s]
 
     def _largest(self, function: Functions, omega: FloatArray) -> float:
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
@@ -214,24 +227,29 @@ class PredictedFigures(DelayFreeFigures):
         (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
         K = self._fed_forward
 
-        def gain(omega: FloatArray, delay_s: float) -> FloatArray:
+        def gain(omega: FloatArray) -> FloatArray:
             s = 1j * omega[:, np.newaxis, np.newaxis]
             R = np.linalg.inv(s * np.eye(len(A)) - A)
-            late = np.exp(-s * (delay_s + half_s))
-            seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
-            commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
-            moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
-            return spectral_norms(out @ moved)
+            at_once, ahead = np.split(np.vstack([K, K @ L]) @ R, 2, axis=1)
+            half, assumed = np.exp(-s * half_s), np.exp(-s * (self.assumed_s + half_s))
+            seen, mismatch, known = at_once @ B * half, ahead @ B, ahead[:, :, :n] @ entry
+            free, driven = out @ R[:, :n, :n] @ entry, out @ R[:, :n] @ B
+            most = np.zeros(omega.size)
+            for delay_s in self.delays_s:
+                late = np.exp(-s * (delay_s + half_s))
+                commands = np.linalg.solve(np.eye(len(K)) - seen - mismatch * (late - assumed), known)
+                most = np.maximum(most, spectral_norms(free + driven @ commands * late))
+            return most
 
         most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
         omega = np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES)[:: self.thinned]
-        return max(self._largest(lambda at, s=s: gain(at, s), omega) for s in self.delays_s)
+        return self._largest(gain, omega)
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
         K, measured = self._fed_forward, self._ahead[:, : self.model.states]
         known = np.broadcast_to(K @ measured, (len(z), len(K), self.model.states))
-        commands = np.linalg.solve(np.eye(len(K)) - K @ self._seen(z, delay_s), known)
+        commands = np.linalg.solve(np.eye(len(K)) - self._seen(K, z, [delay_s])[0], known)
         return float((np.abs(commands) ** 2).sum(axis=2).mean(axis=0).max() ** 0.5)
 
     def _settled_noise(self, delay_s: float) -> float:

@@ -8,12 +8,13 @@ differential equations: experimental comparison", Scientiae Mathematicae Japonic
 """
 
 from collections.abc import Sequence
+from functools import cache
 from math import ceil
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, square_matrices
 
@@ -136,8 +137,8 @@ def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -
 
 def _turning(matrices: FloatArray, weights: FloatArray) -> float:
     """Bound on |Im s| of the roots right of a vertical line on which |e^{-s tau_k}| equals `weights`."""
-    turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
-    return turning + float((np.linalg.norm(matrices[1:], 2, axis=(1, 2)) * weights[1:]).sum())
+    turning = (matrices[:1] - matrices[:1].swapaxes(1, 2)) / 2.0
+    return float(spectral_norms(np.concatenate([turning, matrices[1:]])) @ np.append(1.0, weights[1:]))
 
 
 def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0) -> ComplexArray:
@@ -156,12 +157,14 @@ def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int
         )
     points = ceil(points)
     nodes, derivative = _chebyshev(points)
-    generator = np.kron(derivative * (2.0 / longest), np.eye(n))
+    generator, each = np.zeros((points + 1, n, points + 1, n)), np.arange(n)
+    generator[:, each, :, each] = derivative * (2.0 / longest)
     rows = np.array([_lagrange_row(nodes, 1.0 - 2.0 * delay / longest) for delay in delays])
-    generator[:n] = np.einsum("kp,kij->ipj", rows, matrices).reshape(n, -1)
-    return np.linalg.eigvals(generator).astype(np.complex128)
+    generator[0] = np.einsum("kp,kij->ipj", rows, matrices)
+    return np.linalg.eigvals(generator.reshape(n * points + n, -1)).astype(np.complex128)
 
 
+@cache
 def _chebyshev(points: int) -> tuple[FloatArray, FloatArray]:
     """Chebyshev points 1 = x_0 > ... > x_N = -1 and the differentiation matrix on them.
 

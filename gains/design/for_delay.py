@@ -379,9 +379,8 @@ def _shortfalls(figures: Figures, parts: Sequence[Part]) -> Iterator[float]:
         if (short := part.shortfall(figures)) > 0.0:
             slow = []
             yield _SLOW_PARTS + short
-    if not figures.is_stable_at_delay:
-        yield _UNSTABLE - figures.decay_rate_at_delay_1_s
-        return
     for part in slow:
         if (short := part.shortfall(figures)) > 0.0:
             yield short
+    if not figures.is_stable_at_delay:
+        yield _UNSTABLE - figures.decay_rate_at_delay_1_s
