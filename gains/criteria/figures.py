@@ -140,10 +140,9 @@ class LoopFigures(DelayFreeFigures):
     @property
     def is_stable_at_delay(self) -> bool:
         """Whether the loop is stable at the delay; in searches by its margin if that is known already."""
-        if self.thinned > 1 and not self.discrete and self.timing.loop == "ground":
-            if vars(self).get("delay_margin_s", 0.0) > (self.delay_s or 0.0):
-                return True
-        return self.decay_rate_at_delay_1_s > 0.0
+        shared = self.thinned > 1 and not self.discrete and self.timing.loop == "ground"
+        known_s = vars(self).get("delay_margin_s", 0.0) if shared else 0.0
+        return known_s > (self.delay_s or 0.0) or self.decay_rate_at_delay_1_s > 0.0
 
     @cached_property
     def alpha_at_delay(self) -> float:

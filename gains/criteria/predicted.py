@@ -152,10 +152,9 @@ class PredictedFigures(DelayFreeFigures):
     @property
     def is_stable_at_delay(self) -> bool:
         """Whether the loop is stable at every true delay; in searches also by the window."""
-        if self._is_rough and self.decay_rate_1_s > 0.0 and self.delays_s != (self.assumed_s,):
-            if self.window_s[0] < min(self.delays_s) and max(self.delays_s) < self.window_s[1]:
-                return True
-        return self.decay_rate_at_delay_1_s > 0.0
+        shared = self._is_rough and self.decay_rate_1_s > 0.0 and self.delays_s != (self.assumed_s,)
+        least_s, most_s = self.window_s if shared else (inf, 0.0)
+        return least_s < min(self.delays_s) <= max(self.delays_s) < most_s or self.decay_rate_at_delay_1_s > 0.0
 
     @property
     def _is_rough(self) -> bool:
