@@ -327,19 +327,22 @@ def _best(
 
     Figures are rough during the search. It is repeated with a tighter aim if exact figures miss a part.
     """
-    limits = parts
+    limits, some_meet = parts, False
     enough = min(max(_EVALUATIONS_EACH * starts[0].size, _EVALUATIONS_LEAST), _EVALUATIONS_MOST)
 
     def bounds(point: FloatArray) -> Iterator[Rank]:
+        nonlocal some_meet
         figures, meets = family.figures(point), True
-        if aim.name == "alpha_at_delay":
+        # the cost decides first only among gains that meet the limits
+        if some_meet and aim.name == "alpha_at_delay":
             yield 0.0, -figures.alpha_at_delay_most
-        elif not aim.is_slow:
+        elif some_meet and not aim.is_slow:
             yield 0.0, cost(figures)
         for short in _shortfalls(figures, limits):
             meets = False
             yield short, inf
         if meets:
+            some_meet = True
             yield 0.0, cost(figures)
 
     def cost(figures: Figures) -> float:
