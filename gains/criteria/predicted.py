@@ -223,20 +223,21 @@ class PredictedFigures(DelayFreeFigures):
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
         """Largest gain from disturbances that enter through `entry` to the outputs `out` of the errors."""
-        (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
-        K = self._fed_forward
+        (A, B, alone), L, half_s, r = self._loop, self._ahead, self.period_s / 2.0, self.model.inputs
+        K, n = self._fed_forward, self.model.states
+        enters = np.hstack([B, np.eye(len(A))[:, :n] @ entry]).astype(np.complex128)
+        leaves = np.vstack([K, K @ L, out @ np.eye(len(A))[:n]])
 
         def gain(omega: FloatArray) -> FloatArray:
             s = 1j * omega[:, np.newaxis, np.newaxis]
-            R = np.linalg.inv(s * np.eye(len(A)) - A)
-            at_once, ahead = np.split(np.vstack([K, K @ L]) @ R, 2, axis=1)
-            half, assumed = np.exp(-s * half_s), np.exp(-s * (self.assumed_s + half_s))
-            seen, mismatch, known = at_once @ B * half, ahead @ B, ahead[:, :, :n] @ entry
-            free, driven = out @ R[:, :n, :n] @ entry, out @ R[:, :n] @ B
+            answers = leaves @ np.linalg.solve(s * np.eye(len(A)) - A, enters)
+            seen, mismatch, driven = np.split(answers[:, :, :r], (r, 2 * r), axis=1)
+            known, free = np.split(answers[:, r:, r:], (r,), axis=1)
+            rest = np.eye(r) - seen * np.exp(-s * half_s) + mismatch * np.exp(-s * (self.assumed_s + half_s))
             most = np.zeros(omega.size)
             for delay_s in self.delays_s:
                 late = np.exp(-s * (delay_s + half_s))
-                commands = np.linalg.solve(np.eye(len(K)) - seen - mismatch * (late - assumed), known)
+                commands = np.linalg.solve(rest - mismatch * late, known)
                 most = np.maximum(most, spectral_norms(free + driven @ commands * late))
             return most
 
