@@ -19,27 +19,25 @@ _RESOLUTION = 1e-7
 Rank = tuple[float, float]
 """Merit of a point, the smaller the better: how far it violates the constraints (0 if all hold), then its cost."""
 Bounds = Callable[[FloatArray], Iterable[Rank]]
-"""Lower bounds on the rank of a point, computed one by one as they are read; the last one is the rank."""
+"""Lower bounds on the rank of a point, computed one by one as they are read; the largest is the rank."""
 
 
 def first_of(bounds: Bounds, points: Sequence[FloatArray], count: int) -> list[tuple[Rank, int]]:
     """The ranks and indices of the best `count` points, best first; bounds of the others are read only until they lose.
 
-    >>> first_of(lambda x: [(0.0, 0.0), (0.0, x[0])], [np.array([3.0]), np.array([2.0])], 1)
+    >>> first_of(lambda x: [(0.0, 0.0), (0.0, float(x[0]))], [np.array([3.0]), np.array([2.0])], 1)
     [((0.0, 2.0), 1)]
     """
     found: list[tuple[Rank, int]] = []
     left = [iter(bounds(point)) for point in points]
-    lowest = [(next(each), k, False) for k, each in enumerate(left)]
+    lowest = [(next(each), k) for k, each in enumerate(left)]
     heapify(lowest)
     while len(found) < count:
-        rank, k, is_exact = lowest[0]
-        if is_exact:
-            found.append((rank, k))
-            heappop(lowest)
+        rank, k = lowest[0]
+        if (bound := next(left[k], None)) is None:  # it was exact, and no bound of the others is lower
+            found.append(heappop(lowest))
         else:
-            bound = next(left[k], None)
-            heapreplace(lowest, (rank if bound is None else max(rank, bound), k, bound is None))
+            heapreplace(lowest, (max(rank, bound), k))
     return found
 
 

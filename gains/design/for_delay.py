@@ -361,18 +361,14 @@ def _best(
 
 
 def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
-    return _shortfall(figures, parts) == 0.0
-
-
-def _shortfall(figures: Figures, parts: Sequence[Part]) -> float:
-    """The largest shortfall of gains in any part, or a larger number if the loop is unstable."""
-    return max(_shortfalls(figures, parts), default=0.0)
+    return next(_shortfalls(figures, parts), None) is None
 
 
 def _shortfalls(figures: Figures, parts: Sequence[Part]) -> Iterator[float]:
-    """Lower bounds on the shortfall, the largest of which is exact; none if the gains meet all parts.
+    """Lower bounds on the largest shortfall of gains in any part; none if they meet all.
 
-    Parts that are slow to compute are evaluated only if all others are met.
+    The largest bound is exact, and larger still if the loop is unstable. Parts that are slow to compute are evaluated
+    only if all others are met.
     """
     if figures.decay_rate_1_s <= 0.0:
         yield _UNSTABLE - figures.decay_rate_1_s
