@@ -39,9 +39,12 @@ def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
     return (a + b) / 2.0
 
 
-def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
-    """Abscissa and value of the maximum over a rising grid; local maxima that may exceed the largest are refined."""
-    values = function(grid)
+def highest(function: Functions, grid: FloatArray, values: FloatArray | None = None) -> tuple[float, float]:
+    """Abscissa and value of the maximum over a rising grid; local maxima that may exceed the largest are refined.
+
+    `values` on the grid are computed if they are None.
+    """
+    values = function(grid) if values is None else values
     best = int(np.argmax(values))
     place, height = float(grid[best]), float(values[best])
     inner = np.flatnonzero(may_reach_zero(grid, (values - height)[:, np.newaxis])) + 1

@@ -6,7 +6,8 @@ none at the optimum. Draws are seeded, so the same search finds the same point.
 Source: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with its default constants.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from heapq import heapify, heappop, heapreplace
 
 import numpy as np
 
@@ -17,17 +18,36 @@ _RESOLUTION = 1e-7
 
 Rank = tuple[float, float]
 """Merit of a point, the smaller the better: how far it violates the constraints (0 if all hold), then its cost."""
+Bounds = Callable[[FloatArray], Iterable[Rank]]
+"""Lower bounds on the rank of a point, computed one by one as they are read; the largest is the rank."""
 
 
-def best_of(
-    rank: Callable[[FloatArray], Rank], start: FloatArray, *, step: float, evaluations: int
-) -> tuple[FloatArray, Rank]:
+def first_of(bounds: Bounds, points: Sequence[FloatArray], count: int) -> list[tuple[Rank, int]]:
+    """The ranks and indices of the best `count` points, best first; bounds of the others are read only until they lose.
+
+    >>> first_of(lambda x: [(0.0, 0.0), (0.0, float(x[0]))], [np.array([3.0]), np.array([2.0])], 1)
+    [((0.0, 2.0), 1)]
+    """
+    found: list[tuple[Rank, int]] = []
+    left = [iter(bounds(point)) for point in points]
+    lowest = [(next(each), k) for k, each in enumerate(left)]
+    heapify(lowest)
+    while len(found) < count:
+        rank, k = lowest[0]
+        if (bound := next(left[k], None)) is None:  # it was exact, and no bound of the others is lower
+            found.append(heappop(lowest))
+        else:
+            heapreplace(lowest, (max(rank, bound), k))
+    return found
+
+
+def best_of(bounds: Bounds, start: FloatArray, *, step: float, evaluations: int) -> tuple[FloatArray, Rank]:
     """Return the best point found from `start` (n,) and its rank.
 
-    `step` is the standard deviation of the first draws along every axis. About `evaluations` points are evaluated,
+    `step` is the standard deviation of the first draws along every axis. About `evaluations` points are compared,
     fewer if the draws contract sooner.
 
-    >>> point, _ = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
+    >>> point, _ = best_of(lambda x: [(0.0, abs(x[0] - 1.0) + abs(x[1]))], np.zeros(2), step=0.5, evaluations=600)
     >>> (point**2).round(3).tolist()
     [1.0, 0.0]
     """
@@ -47,7 +67,7 @@ def best_of(
     rng = np.random.default_rng(0)
     mean, covariance, sigma = start.astype(np.float64), np.eye(n), step
     path, sigma_path = np.zeros(n), np.zeros(n)
-    best = mean, rank(mean)
+    best = mean, first_of(bounds, [mean], 1)[0][0]
     for turn in range(max(1, evaluations // population)):
         values, axes = np.linalg.eigh((covariance + covariance.T) / 2)
         lengths = np.sqrt(values.clip(min=1e-20))
@@ -55,11 +75,11 @@ def best_of(
             break
         draws = rng.standard_normal((population, n)) * lengths @ axes.T
         points = mean + sigma * draws
-        ranks = [rank(point) for point in points]
-        order = sorted(range(population), key=lambda k: ranks[k])
-        if ranks[order[0]] < best[1]:
-            best = points[order[0]], ranks[order[0]]
-        chosen = draws[order[:parents]]
+        first = first_of(bounds, [*points], parents)
+        (rank, k), *_ = first
+        if rank < best[1]:
+            best = points[k], rank
+        chosen = draws[[k for _, k in first]]
         shift = weights @ chosen
         mean = mean + sigma * shift
         sigma_path = (1 - c_sigma) * sigma_path + (c_sigma * (2 - c_sigma) * mass) ** 0.5 * (

@@ -10,6 +10,7 @@ each block is analysed on its own, and equal blocks only once.
 import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from graphlib import TopologicalSorter
 from math import inf, log2
 from numbers import Real
@@ -133,6 +134,13 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     for matrix in matrices[1:]:
         pattern |= matrix != 0.0
     np.fill_diagonal(pattern, True)  # a state is connected to itself
+    return [*_blocks_of_pattern(len(pattern), pattern.tobytes())]
+
+
+@lru_cache(maxsize=64)
+def _blocks_of_pattern(size: int, content: bytes) -> list[IntArray]:
+    """`strongly_connected_blocks` of a pattern: a search asks for many loops of the same pattern."""
+    pattern = np.frombuffer(content, dtype=np.bool_).reshape(size, size)
     # shortcut for dense loops: every state drives the first one and is driven by it
     if bool(pattern[0].all() and pattern[:, 0].all()):
         return [np.arange(len(pattern))]

@@ -7,7 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core._bracketing import highest
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.structure import roots_of
 from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.constant import analyse_delay, delay_margin
@@ -136,23 +137,45 @@ class LoopFigures(DelayFreeFigures):
         own_s, late_s = self.timing.delays_s(self.delay_s)
         return -rightmost_root([(A, 0.0), (B @ own, own_s), (B @ (K - own), late_s)]).real
 
+    @property
+    def is_stable_at_delay(self) -> bool:
+        """Whether the loop is stable at the delay; in searches by its margin if that is known already."""
+        shared = self.thinned > 1 and not self.discrete and self.timing.loop == "ground"
+        known_s = vars(self).get("delay_margin_s", 0.0) if shared else 0.0
+        return known_s > (self.delay_s or 0.0) or self.decay_rate_at_delay_1_s > 0.0
+
     @cached_property
     def alpha_at_delay(self) -> float:
         """α at the delay; 0 if the loop is unstable there."""
         if self.delay_s is None:
             return self.alpha
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return 0.0
         if self.discrete:
             loop = formation_loop(self.model, self.K, self.responses)
             flown = DisturbedFormation(self.model, *loop, self.timing.period_s, self.delay_s)
             return SectorLoop(flown, tuple(range(self.model.states)), self.W).complex_radius().radius_1_s
-        return 1.0 / peak_gain(self._characteristic, np.eye(self.model.states), self.W, self._frequencies)
+        return 1.0 / highest(self._sensitivity, self._frequencies, self._scanned)[1]
+
+    @cached_property
+    def alpha_at_delay_most(self) -> float:
+        """An upper bound on α at the delay, quick to compute; exact without delay."""
+        if self.delay_s is None or self.discrete:
+            return self.alpha_at_delay
+        return 1.0 / float(self._scanned.max())
+
+    @cached_property
+    def _scanned(self) -> FloatArray:
+        return self._sensitivity(self._frequencies)
+
+    def _sensitivity(self, omega: FloatArray) -> FloatArray:
+        """The largest gain from disturbances of the states to weighted errors at each frequency."""
+        return spectral_norms(self.W @ np.linalg.inv(self._characteristic(omega)))
 
     @cached_property
     def spacing_gain_max_s2(self) -> float:
         """H∞ gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable, 0 for one vehicle."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         if self.model.vehicles == 1:
             return 0.0
@@ -162,7 +185,7 @@ class LoopFigures(DelayFreeFigures):
     @cached_property
     def noise_gain_max(self) -> float:
         """H2 gain from measurement noise to the noisiest command, in the ground loop; `inf` if it is unstable."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         loop = formation_loop(self.model, self.K, self.responses)
         return noise_gain(*loop, period_s=self.timing.period_s, delay_s=self.delay_s or 0.0)

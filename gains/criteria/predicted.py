@@ -27,6 +27,7 @@ For disturbances the loop is continuous, R = (s I - A)^{-1}, and a hold counts a
 sampled loop.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, pi
@@ -110,7 +111,7 @@ class PredictedFigures(DelayFreeFigures):
     @cached_property
     def window_s(self) -> tuple[float, float]:
         """The least and the largest stable true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
-        if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
+        if not self._is_rough:
             timing = Timing(self.period_s, self.period_s)
             return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
         half_s = self.period_s / 2.0
@@ -148,15 +149,33 @@ class PredictedFigures(DelayFreeFigures):
 
         return min(map(decay, self.delays_s))
 
-    @cached_property
+    @property
+    def is_stable_at_delay(self) -> bool:
+        """Whether the loop is stable at every true delay; in searches also by the window."""
+        shared = self._is_rough and self.decay_rate_1_s > 0.0 and self.delays_s != (self.assumed_s,)
+        least_s, most_s = self.window_s if shared else (inf, 0.0)
+        return least_s < min(self.delays_s) <= max(self.delays_s) < most_s or self.decay_rate_at_delay_1_s > 0.0
+
+    @property
+    def _is_rough(self) -> bool:
+        """Whether the window is that of the continuous loop."""
+        return self.thinned > 1 and self.assumed_s >= _SHORT * self.period_s
+
+    @property
     def alpha_at_delay(self) -> float:
         """The complex stability radius, as in `gains.performance.flown`; 0 if the loop is unstable."""
-        heavy, states = self.W, np.eye(self.model.states)
-        return 1.0 / gain if (gain := self._peak(heavy, states)) < inf else 0.0
+        return self.alpha_at_delay_most if self.is_stable_at_delay else 0.0
+
+    @cached_property
+    def alpha_at_delay_most(self) -> float:
+        """α at the delay, if the loop is stable."""
+        return 1.0 / self._peak(self.W, np.eye(self.model.states))
 
     @cached_property
     def spacing_gain_max_s2(self) -> float:
         """H-infinity gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable."""
+        if not self.is_stable_at_delay:
+            return inf
         rows = self.model.spacing_mask
         return self._peak(np.eye(self.model.states)[rows], self.model.B) if rows.any() else 0.0
 
@@ -177,52 +196,60 @@ class PredictedFigures(DelayFreeFigures):
         """Largest growth of a commanded motion from vehicle to vehicle; 1 if there is no chain."""
         if not self.chain:
             return 1.0
-        if self.decay_rate_at_delay_1_s <= 0.0:
+        if not self.is_stable_at_delay:
             return inf
         omega = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)[:: self.thinned]
-        return max(1.0, *(self._largest(lambda at, s=s: self.growth(at, s), omega) for s in self.delays_s))
+        return max(1.0, self._largest(lambda at: self.growth(at, *self.delays_s), omega))
 
-    def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
-        """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`."""
+    def growth(self, omega: FloatArray, *delays_s: float) -> FloatArray:
+        """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`.
+
+        The largest over the true delays.
+        """
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
-        front, own = (self._loop[2][1] @ self._seen(z, delay_s)).T
-        return np.abs((self.feed_forward + front) / (1.0 - own))
+        front, own = np.array(self._seen(self._loop[2][1:2], z, delays_s))[:, :, 0].T
+        return np.abs((self.feed_forward + front) / (1.0 - own)).max(axis=1)
 
-    def _seen(self, z: ComplexArray, delay_s: float) -> ComplexArray:
-        """S of the module's docstring, at points z (k, 1, 1)."""
+    def _seen(self, K: FloatArray, z: ComplexArray, delays_s: Sequence[float]) -> list[ComplexArray]:
+        """K S of the module's docstring at each true delay, at points z (k, 1, 1)."""
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-        R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
-        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
-        return R @ G + self._ahead @ R @ mismatch
+        both = np.vstack([K, K @ self._ahead]).T.astype(np.complex128)
+        at_once, ahead = np.split(np.linalg.solve(z * np.eye(len(Phi)) - Phi.T, both).swapaxes(1, 2), 2, axis=1)
+        assumed, answer = held_entry(self._plant, z, self.assumed_s), at_once @ G
+        return [answer + ahead @ (held_entry(self._plant, z, delay_s) - assumed) for delay_s in delays_s]
 
     def _largest(self, function: Functions, omega: FloatArray) -> float:
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
         """Largest gain from disturbances that enter through `entry` to the outputs `out` of the errors."""
-        if self.decay_rate_at_delay_1_s <= 0.0:
-            return inf
-        (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
-        K = self._fed_forward
+        (A, B, alone), L, half_s, r = self._loop, self._ahead, self.period_s / 2.0, self.model.inputs
+        K, n = self._fed_forward, self.model.states
+        enters = np.hstack([B, np.eye(len(A))[:, :n] @ entry]).astype(np.complex128)
+        leaves = np.vstack([K, K @ L, out @ np.eye(len(A))[:n]])
 
-        def gain(omega: FloatArray, delay_s: float) -> FloatArray:
+        def gain(omega: FloatArray) -> FloatArray:
             s = 1j * omega[:, np.newaxis, np.newaxis]
-            R = np.linalg.inv(s * np.eye(len(A)) - A)
-            late = np.exp(-s * (delay_s + half_s))
-            seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
-            commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
-            moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
-            return spectral_norms(out @ moved)
+            answers = leaves @ np.linalg.solve(s * np.eye(len(A)) - A, enters)
+            seen, mismatch, driven = np.split(answers[:, :, :r], (r, 2 * r), axis=1)
+            known, free = np.split(answers[:, r:, r:], (r,), axis=1)
+            rest = np.eye(r) - seen * np.exp(-s * half_s) + mismatch * np.exp(-s * (self.assumed_s + half_s))
+            most = np.zeros(omega.size)
+            for delay_s in self.delays_s:
+                late = np.exp(-s * (delay_s + half_s))
+                commands = np.linalg.solve(rest - mismatch * late, known)
+                most = np.maximum(most, spectral_norms(free + driven @ commands * late))
+            return most
 
         most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
         omega = np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES)[:: self.thinned]
-        return max(self._largest(lambda at, s=s: gain(at, s), omega) for s in self.delays_s)
+        return self._largest(gain, omega)
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
         K, measured = self._fed_forward, self._ahead[:, : self.model.states]
         known = np.broadcast_to(K @ measured, (len(z), len(K), self.model.states))
-        commands = np.linalg.solve(np.eye(len(K)) - K @ self._seen(z, delay_s), known)
+        commands = np.linalg.solve(np.eye(len(K)) - self._seen(K, z, [delay_s])[0], known)
         return float((np.abs(commands) ** 2).sum(axis=2).mean(axis=0).max() ** 0.5)
 
     def _settled_noise(self, delay_s: float) -> float:

@@ -1,19 +1,21 @@
 """Rightmost characteristic roots of a linear system with any number of constant delays.
 
 x'(t) = sum_k A_k x(t - tau_k) is u' = D u on functions over [-tau_max, 0]. On Chebyshev points D is a matrix whose
-eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact.
+eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact. Only
+what the delayed terms see of the past is kept, C x with A_k = A_k C'C for all of them: few numbers if inputs are few.
 
 This approach and others are compared in D. Breda, "Methods for numerical computation of characteristic roots for delay
 differential equations: experimental comparison", Scientiae Mathematicae Japonicae Online 8 (2003), 317-328.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from math import ceil
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, square_matrices
 
@@ -23,6 +25,7 @@ _POINTS = 12
 _LARGEST_MATRIX = 1500
 # roots of two discretisations this close together (relative) are the same root
 _SAME = 1e-6
+_EPS = float(np.finfo(np.float64).eps)
 
 
 def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
@@ -73,7 +76,7 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
         return [root for root in found if root.imag >= 0.0]
     matrices = np.concatenate([matrices[~late].sum(axis=0)[np.newaxis], matrices[late]])
     delays = np.concatenate([[0.0], delays[late]])
-    approximations = _pseudospectral_roots(matrices, delays, count - 1)
+    approximations, _ = _pseudospectral_roots(matrices, delays, count - 1)
     upper = approximations[approximations.imag >= 0.0]
     upper = upper[np.argsort(-upper.real)]
     # the rightmost approximation need not belong to the rightmost root, so all within its error band are refined
@@ -96,7 +99,7 @@ def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) ->
     """
     rightmost: list[complex] = []
     while True:
-        approximations = _pseudospectral_roots(matrices, delays, count - 1, finer=2.0 ** len(rightmost))
+        approximations, points = _pseudospectral_roots(matrices, delays, count - 1, finer=2.0 ** len(rightmost))
         upper = approximations[approximations.imag >= 0.0]
         found: list[complex] = []
         for start in upper[np.argsort(-upper.real)].tolist():
@@ -107,8 +110,7 @@ def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) ->
         rightmost.append(s)
         with np.errstate(over="ignore"):
             highest = _turning(matrices, np.exp(-s.real * delays))
-        resolved = len(approximations) / matrices.shape[1] - 1.0
-        enough = resolved >= _POINTS + np.hypot(highest, s.real) * float(delays.max()) / 2.0
+        enough = points >= _POINTS + np.hypot(highest, s.real) * float(delays.max()) / 2.0
         if enough or (len(rightmost) > 2 and max(abs(s - other) for other in rightmost[-3:]) <= _SAME * abs(s)):
             return found
 
@@ -136,32 +138,41 @@ def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -
 
 def _turning(matrices: FloatArray, weights: FloatArray) -> float:
     """Bound on |Im s| of the roots right of a vertical line on which |e^{-s tau_k}| equals `weights`."""
-    turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
-    return turning + float((np.linalg.norm(matrices[1:], 2, axis=(1, 2)) * weights[1:]).sum())
+    turning = (matrices[:1] - matrices[:1].swapaxes(1, 2)) / 2.0
+    return float(spectral_norms(np.concatenate([turning, matrices[1:]])) @ np.append(1.0, weights[1:]))
 
 
-def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0) -> ComplexArray:
-    """Eigenvalues of the discretised generator; block row 0 is the equation, the other rows differentiate.
+def _pseudospectral_roots(
+    matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0
+) -> tuple[ComplexArray, int]:
+    """Eigenvalues of the discretised generator, and its points; the first rows are the equation, others differentiate.
 
     Each of the `further` roots to the left makes one more turn over the longest delay and takes four more points.
     """
     n, longest = matrices.shape[1], float(delays.max())
+    _, singular, seen = np.linalg.svd(matrices[1:].reshape(-1, n), full_matrices=False)
+    seen = seen[singular > len(matrices) * n * _EPS * singular[0]]
     # bound for roots near or right of the axis
     highest = _turning(matrices, np.ones(len(delays)))
     points = finer * (_POINTS + highest * longest / 2.0 + 4.0 * further)
-    if not n * (points + 1.0) <= _LARGEST_MATRIX:
+    if not n + len(seen) * points <= _LARGEST_MATRIX:
         raise BadModelError(
-            f"the longest delay is {longest} s and a block of {n} states may oscillate at {highest:.3g} rad/s, "
-            f"which takes {points:.3g} points; n times points below {_LARGEST_MATRIX} is wanted"
+            f"the longest delay is {longest} s and a block of {n} states may oscillate at {highest:.3g} rad/s, which "
+            f"takes {points:.3g} points for each of {len(seen)} late signals; at most {_LARGEST_MATRIX} are wanted"
         )
     points = ceil(points)
     nodes, derivative = _chebyshev(points)
-    generator = np.kron(derivative * (2.0 / longest), np.eye(n))
+    derivative = derivative[1:] * (2.0 / longest)
     rows = np.array([_lagrange_row(nodes, 1.0 - 2.0 * delay / longest) for delay in delays])
-    generator[:n] = np.einsum("kp,kij->ipj", rows, matrices).reshape(n, -1)
-    return np.linalg.eigvals(generator).astype(np.complex128)
+    acts = np.einsum("kp,kij->ipj", rows, matrices)
+    late = (acts[:, 1:] @ seen.T).reshape(n, -1)
+    now = (derivative[:, :1, np.newaxis] * seen).reshape(-1, n)
+    past = derivative[:, np.newaxis, 1:, np.newaxis] * np.eye(len(seen))[:, np.newaxis]
+    generator = np.block([[acts[:, 0], late], [now, past.reshape(len(now), -1)]])
+    return np.linalg.eigvals(generator).astype(np.complex128), points
 
 
+@cache
 def _chebyshev(points: int) -> tuple[FloatArray, FloatArray]:
     """Chebyshev points 1 = x_0 > ... > x_N = -1 and the differentiation matrix on them.
 

@@ -6,7 +6,7 @@ figures of `gains.criteria.figures` at the delay: first by their shortfall from 
 The gains with the fastest decay are known in closed form, and every search includes them in its starts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gains.core._evolution import Rank, best_of
+from gains.core._evolution import Rank, best_of, first_of
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import Requirement
@@ -267,18 +267,15 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None
     assert wanted.criteria is not None
     objective = wanted.criteria.objective or ("alpha" if wanted.delay_margin_s is not None else "delay_margin_s")
     parts = parts_of(wanted)
-
-    def cost(figures: Figures) -> float:
-        return -float(getattr(figures, objective))
-
-    found = _best(family, parts, cost, family.starts, evaluations)
+    aim = Part(objective, 0.0, True)
+    found = _best(family, parts, aim, family.starts, evaluations)
     if _meets(found[1], parts):
         return found
     most: list[Reached] = []
     for part in parts:
         most.append(_most(family, part, parts, evaluations))
         if _meets(most[-1][1], parts):
-            better = _best(family, parts, cost, [most[-1][0]], evaluations)
+            better = _best(family, parts, aim, [most[-1][0]], evaluations)
             return better if _meets(better[1], parts) else most[-1]
     if not parts:
         raise InfeasibleError(f"found no stable gains at at_delay_s = {wanted.criteria.at_delay_s}; try a shorter one")
@@ -316,15 +313,13 @@ def _most(family: GainFamily, part: Part, parts: Sequence[Part], evaluations: in
 
     The value wanted of the part has no influence, so a requirement for what they reach leads to the same gains.
     """
-    sign = 1.0 if part.at_least else -1.0
-    others = [other for other in parts if other is not part]
-    return _best(family, others, lambda figures: -sign * part.figure(figures), family.starts, evaluations)
+    return _best(family, [other for other in parts if other is not part], part, family.starts, evaluations)
 
 
 def _best(
     family: GainFamily,
     parts: Sequence[Part],
-    cost: Callable[[Figures], float],
+    aim: Part,
     starts: Sequence[FloatArray],
     evaluations: int | None,
 ) -> Reached:
@@ -332,38 +327,59 @@ def _best(
 
     Figures are rough during the search. It is repeated with a tighter aim if exact figures miss a part.
     """
-    aims = parts
+    limits, some_meet = parts, False
     enough = min(max(_EVALUATIONS_EACH * starts[0].size, _EVALUATIONS_LEAST), _EVALUATIONS_MOST)
 
-    def rank(point: FloatArray) -> Rank:
-        figures = family.figures(point)
-        short = _shortfall(figures, aims)
-        return short, cost(figures) if short == 0.0 else inf
+    def bounds(point: FloatArray) -> Iterator[Rank]:
+        nonlocal some_meet
+        figures, meets = family.figures(point), True
+        # the cost decides first only among gains that meet the limits
+        if some_meet and aim.name == "alpha_at_delay":
+            yield 0.0, -figures.alpha_at_delay_most
+        elif some_meet and not aim.is_slow:
+            yield 0.0, cost(figures)
+        for short in _shortfalls(figures, limits):
+            meets = False
+            yield short, inf
+        if meets:
+            some_meet = True
+            yield 0.0, cost(figures)
+
+    def cost(figures: Figures) -> float:
+        return aim.figure(figures) * (-1.0 if aim.at_least else 1.0)
 
     for turn in count(1):
-        point, reached = best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations or enough)
+        [(_, best)] = first_of(bounds, starts, 1)
+        point, reached = best_of(bounds, starts[best], step=family.step, evaluations=evaluations or enough)
         for finer in _FINER if evaluations is None and starts[0].size > _FEW else ():
-            point, reached = best_of(rank, point, step=family.step / finer, evaluations=enough)
+            point, reached = best_of(bounds, point, step=family.step / finer, evaluations=enough)
         exact = family.figures(point).exact
         if turn == _AIMS or reached[0] > 0.0 or _meets(exact, parts):
             return point, exact
-        aims = [aim.tightened(part.shortfall(exact)) for aim, part in zip(aims, parts, strict=True)]
+        limits = [own.tightened(part.shortfall(exact)) for own, part in zip(limits, parts, strict=True)]
     raise AssertionError
 
 
 def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
-    return _shortfall(figures, parts) == 0.0
+    return next(_shortfalls(figures, parts), None) is None
 
 
-def _shortfall(figures: Figures, parts: Sequence[Part]) -> float:
-    """The largest shortfall of gains in any part, or a larger number if the loop is unstable.
+def _shortfalls(figures: Figures, parts: Sequence[Part]) -> Iterator[float]:
+    """Lower bounds on the largest shortfall of gains in any part; none if they meet all.
 
-    Parts that are slow to compute are evaluated only if all others are met.
+    The largest bound is exact, and larger still if the loop is unstable. Parts that are slow to compute are evaluated
+    only if all others are met.
     """
-    for slowest in (figures.decay_rate_1_s, figures.decay_rate_at_delay_1_s):
-        if slowest <= 0.0:
-            return _UNSTABLE - slowest
-    quick = max((part.shortfall(figures) for part in parts if not part.is_slow), default=0.0)
-    if quick > 0.0:
-        return _SLOW_PARTS + quick
-    return max((part.shortfall(figures) for part in parts if part.is_slow), default=0.0)
+    if figures.decay_rate_1_s <= 0.0:
+        yield _UNSTABLE - figures.decay_rate_1_s
+        return
+    quick, slow = ([part for part in parts if part.is_slow is is_slow] for is_slow in (False, True))
+    for part in quick:
+        if (short := part.shortfall(figures)) > 0.0:
+            slow = []
+            yield _SLOW_PARTS + short
+    for part in slow:
+        if (short := part.shortfall(figures)) > 0.0:
+            yield short
+    if not figures.is_stable_at_delay:
+        yield _UNSTABLE - figures.decay_rate_at_delay_1_s

@@ -99,8 +99,14 @@ def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_on
     """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
 
     `less_one` gives e^{X t} - I, with all its digits however short t is. All durations share the powers of X: SciPy's
-    `expm` takes 60 us for each matrix of a stack.
+    `expm` takes 60 us for each matrix of a stack. The last ones are kept: a search asks for those of one plant only.
     """
+    return _exponentials(len(generator), generator.tobytes(), durations.tobytes(), less_one)
+
+
+@lru_cache(maxsize=16)
+def _exponentials(size: int, content: bytes, at_s: bytes, less_one: bool) -> FloatArray:
+    generator, durations = np.frombuffer(content).reshape(size, size), np.frombuffer(at_s)
     longest = float(durations.max(initial=0.0))
     norm = float(np.abs(generator).sum(axis=-1).max(initial=0.0)) * longest
     squarings = max(0, int(np.ceil(np.log2(norm / 0.5)))) if norm > 0.0 else 0
@@ -113,6 +119,7 @@ def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_on
     result = np.tensordot(np.vander(shares, 15, increasing=True)[:, first:], np.array(terms[first:]), 1)
     for _ in range(squarings):
         result = result @ result + 2.0 * result if less_one else result @ result
+    result.flags.writeable = False
     return result
 
 
