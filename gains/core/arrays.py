@@ -20,6 +20,8 @@ def spectral_norms(matrices: NDArray[Any]) -> FloatArray:
     """
     if min(matrices.shape[1:]) == 1:
         return np.sqrt((np.abs(matrices) ** 2).sum(axis=(1, 2)))
+    size = 2.0 ** (np.frexp(np.abs(matrices).max(initial=0.0))[1] - 1)  # else squares may overflow
+    matrices = matrices / size
     adjoint = matrices.conj().swapaxes(1, 2)
     squares = matrices @ adjoint if matrices.shape[1] < matrices.shape[2] else adjoint @ matrices
-    return np.sqrt(np.linalg.eigvalsh(squares)[:, -1].clip(min=0.0))
+    return size * np.sqrt(np.linalg.eigvalsh(squares)[:, -1].clip(min=0.0))

@@ -137,7 +137,7 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     return [*_blocks_of_pattern(len(pattern), pattern.tobytes())]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=8)
 def _blocks_of_pattern(size: int, content: bytes) -> list[IntArray]:
     """`strongly_connected_blocks` of a pattern: a search asks for many loops of the same pattern."""
     pattern = np.frombuffer(content, dtype=np.bool_).reshape(size, size)
