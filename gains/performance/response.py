@@ -15,6 +15,7 @@ and `gains.sampled.multirate` compute the margin.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import factorial, inf
 
 import numpy as np
@@ -96,9 +97,10 @@ def own_dynamics(response: Response) -> tuple[FloatArray, FloatArray]:
         own = np.array([[0.0, 1.0], [-(natural**2), -lag_s * natural**2]])
         entry = np.array([[0.0], [natural**2]])
     if response.dead_time_s:
-        line, into, out, through = _dead_time(response.dead_time_s)
-        own = np.block([[own, entry @ out], [np.zeros((_ORDER, len(own))), line]])
-        entry = np.vstack([through * entry, into])
+        line, into, out, through = _dead_time()
+        m, late = len(own), np.zeros((len(own) + _ORDER, len(own) + _ORDER))
+        late[:m, :m], late[:m, m:], late[m:, m:] = own, entry @ out, line / response.dead_time_s
+        own, entry = late, np.vstack([through * entry, into / response.dead_time_s])
     if g == 0.0:
         return own, entry
     n = len(own)
@@ -107,8 +109,9 @@ def own_dynamics(response: Response) -> tuple[FloatArray, FloatArray]:
     return A, B
 
 
-def _dead_time(dead_time_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """A dead time as x' = A x + B w, w_late = C x + D w: the Pade approximation of e^{-sT}, companion form in s T."""
+@cache
+def _dead_time() -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """A dead time T as T x' = A x + B w, w_late = C x + D w: the Pade approximation of e^{-sT}, in companion form."""
     n = _ORDER
     c = [factorial(2 * n - k) / (factorial(k) * factorial(n - k)) for k in range(n + 1)]
     below = np.array(c) / c[n]
@@ -117,7 +120,7 @@ def _dead_time(dead_time_s: float) -> tuple[FloatArray, FloatArray, FloatArray, 
     A[-1] = -below[:n]
     B = np.zeros((n, 1))
     B[-1] = 1.0
-    return A / dead_time_s, B / dead_time_s, (above[:n] - above[n] * below[:n])[np.newaxis], float(above[n])
+    return A, B, (above[:n] - above[n] * below[:n])[np.newaxis], float(above[n])
 
 
 def formation_loop(

@@ -1,5 +1,6 @@
 """A fleet of vehicles with autopilots: start-up, one common frame, identification, set-points."""
 
+from collections.abc import Sequence
 from math import hypot
 
 import numpy as np
@@ -50,6 +51,8 @@ class AutopilotFleet(Fleet):
         """What each vehicle lacks, and since when; the time is 0 once that has been reported."""
         self._located: set[int] = set()
         """The rows whose frame has been known."""
+        self._frames: list[object] = []
+        """What the frames were last computed from, once all origins are known."""
         self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
         self._targets = VelocityTargets(self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
@@ -112,6 +115,10 @@ class AutopilotFleet(Fleet):
     def locate(self, history: StateHistory) -> None:
         """Update the origins of the local frames. States reported before their frame moved are dropped."""
         first = next(start for start, vehicle in zip(self.starts, self.vehicles, strict=True) if not vehicle.left_out)
+        frames = [first, *((startup.origin, startup.origin_altitude_m) for startup in self.starts)]
+        if frames == self._frames:
+            return
+        self._frames = frames if all(startup.origin for startup in self.starts) else []
         for row, startup in enumerate(self.starts):
             if startup.origin is None and row in self._located:  # it has restarted
                 history.forget(row)
@@ -149,18 +156,28 @@ class AutopilotFleet(Fleet):
     def set_points(self, orders: Orders, phase: Phase) -> Records:
         points = np.zeros(len(self.vehicles), mavlink.SET_POINT)
         points["type_mask"] = mavlink.IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION
-        for row in range(len(self.vehicles)):
-            point = self._set_point(row, orders, phase)
-            if point is not None:
-                points["sent"][row] = True
-                points["velocity_ned_m_s"][row], points["acceleration_ne_m_s2"][row] = point
+        controls = orders.controls
+        columns = controls["command_m_s2"].tolist(), controls["sample_ns"].tolist(), controls["state"].tolist()
+        every = zip(*columns, orders.commanded.tolist(), strict=True)
+        made = [self._set_point(row, *control, orders.due_ns, phase) for row, control in enumerate(every)]
+        rows = [row for row, point in enumerate(made) if point is not None]
+        if rows:
+            velocities, accelerations = zip(*filter(None, made), strict=True)
+            points["sent"][rows] = True
+            points["velocity_ned_m_s"][rows], points["acceleration_ne_m_s2"][rows] = velocities, accelerations
         return points
 
-    def _set_point(self, row: int, orders: Orders, phase: Phase) -> VelocitySetPoint | None:
-        vehicle, control, due_ns = self.vehicles[row], orders.controls[row], orders.due_ns
-        commanded = bool(orders.commanded[row])
-        (north, east), sample_ns = control["command_m_s2"].tolist(), control["sample_ns"].item()
-        command, known = (north, east), sample_ns > 0
+    def _set_point(
+        self,
+        row: int,
+        command_m_s2: Sequence[float],
+        sample_ns: int,
+        state: Sequence[float],
+        commanded: bool,
+        due_ns: int,
+        phase: Phase,
+    ) -> VelocitySetPoint | None:
+        vehicle, command, known = self.vehicles[row], (command_m_s2[0], command_m_s2[1]), sample_ns > 0
         if vehicle.left_out:
             return None
         piloted = vehicle.taken_over and vehicle.kind.guided_first
@@ -181,5 +198,4 @@ class AutopilotFleet(Fleet):
         self.loop.remember(row, due_ns, command)
         late_s = (due_ns - sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if sample_ns else 0.0
         lead_m_s = self._bounds.acceleration_m_s2(row) * (late_s + _LEAD_S)
-        _, _, v_north, v_east = control["state"].tolist()
-        return self._targets.accelerate(row, command, (v_north, v_east), lead_m_s=lead_m_s, now_ns=due_ns)
+        return self._targets.accelerate(row, command, (state[2], state[3]), lead_m_s=lead_m_s, now_ns=due_ns)

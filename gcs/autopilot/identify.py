@@ -16,12 +16,13 @@ the vehicle's clock. So the identified response does not include the link delay.
 
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from math import hypot, inf, pi, sin, sqrt
 
 import numpy as np
 from scipy.linalg import expm
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.performance.response import Response, own_dynamics
 
 LONGEST_S = 6.0
@@ -112,6 +113,12 @@ class Flown:
     def has_too_few_samples(self) -> bool:
         return self.sample_s.size < _FEWEST_SAMPLES or self.command_m_s2.size < 2
 
+    @cached_property
+    def _spectrum(self) -> tuple[int, ComplexArray]:
+        """The size of a transform in which the commands do not wrap around, and theirs."""
+        size = 1 << (2 * self.command_m_s2.size).bit_length()
+        return size, np.fft.rfft(self.command_m_s2, size)
+
     def velocities(self, responses: list[Response]) -> FloatArray:
         """The modelled velocity at each sample, for each of k responses of one model, shape (k, n).
 
@@ -131,8 +138,8 @@ class Flown:
             answers = np.concatenate([answers, power @ answers], axis=2)
             power = power @ power
         answers = answers[:, [0, n], :m]
-        size = 1 << (2 * m).bit_length()
-        spectrum = np.fft.rfft(answers, size) * np.fft.rfft(self.command_m_s2, size)
+        size, commanded = self._spectrum
+        spectrum = np.fft.rfft(answers, size) * commanded
         at_ticks = np.zeros((len(responses), 2, m + 1))
         at_ticks[:, :, 1:] = np.fft.irfft(spectrum, size)[:, :, :m]
         index = np.minimum((self.sample_s / h).astype(np.int64), m - 1)

@@ -111,10 +111,11 @@ class Bounds:
     def bound(self, controls: Records, blends: Records) -> None:
         """Keep the commands on the braking curve and within the limits of acceleration and jerk."""
         flown = blends["flown"].tolist()
-        both = zip(controls["command_m_s2"].tolist(), controls["spacing_error_m"].tolist(), strict=True)
-        for row, (command, spacing_error) in enumerate(both):
-            if isfinite(command[0]) and isfinite(command[1]):
-                controls["command_m_s2"][row] = self._bounded(row, command, spacing_error, flown[row])
+        commands = controls["command_m_s2"].tolist()
+        for row, spacing_error in enumerate(controls["spacing_error_m"].tolist()):
+            if isfinite(commands[row][0]) and isfinite(commands[row][1]):
+                commands[row] = self._bounded(row, commands[row], spacing_error, flown[row])
+        controls["command_m_s2"] = commands
 
     def _bounded(
         self, row: int, command_m_s2: Sequence[float], spacing_error_m: Sequence[float], flown: int

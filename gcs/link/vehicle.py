@@ -278,8 +278,7 @@ class RemoteVehicle:
         self._report = report
         self._command: _Waiting | None = None
         self._settled = False
-        """Whether the vehicle takes set-points and lacks nothing: no command is due until it reports otherwise. One
-        with an autopilot never counts as settled, because its start-up depends on time."""
+        """Whether the vehicle takes set-points and lacks nothing: no command is due until it reports otherwise."""
         self._earlier = 0, 0
         """A command that was sent more than once, and how many answers to its copies may still arrive."""
         self._unanswered_ns = 0
@@ -313,7 +312,7 @@ class RemoteVehicle:
     @property
     def idle(self) -> bool:
         """Whether `next_frame` has nothing to send until the vehicle sends a message."""
-        return self._settled and self.goal is Goal.FLY
+        return self._settled and self.goal is Goal.FLY and not self.kind.piloted  # autopilots are asked for limits
 
     @property
     def quiet_until_ns(self) -> float:
@@ -408,6 +407,7 @@ class RemoteVehicle:
     def pass_to_startup(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         """Pass a message to the start-up, after the position that kernels have stored and not passed on."""
         self._pass_position()
+        self._settled &= not self.kind.piloted
         self.startup.take(msg_id, fields)
 
     def _pass_position(self) -> None:
@@ -551,13 +551,16 @@ class RemoteVehicle:
         self._now_ns = now_ns
         if self.address is None or self.idle:
             return None
-        frame = self._next_command(now_ns)
+        settled = self._settled and self.goal is Goal.FLY
+        if settled:
+            self._pass_position()
+        frame = None if settled else self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:
             rtt_ns, due = self.clock.rtt_ns or 0, None
             if not self.external:
                 due = self.startup.next_parameter(now_ns, target_system=self.wire_id, rtt_ns=rtt_ns)
-            idle = due is None and self._command is None and not self.kind.piloted
-            self._settled = idle and not self._next_step().missing
+            idle = due is None and self._command is None and self.guided
+            self._settled = settled or (idle and not self._next_step().missing)
             return None if due is None else self.encode(*due)
         return frame
 

@@ -23,7 +23,9 @@ from scenarios.sockets import Bytes, Ints
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
 from sim_vehicles.links.links import Link, LinkSet, is_set_point
 from sim_vehicles.links.truth import MemoryRecorder, Recorder, can_record
+from sim_vehicles.motion.copter import Motion, Target, advance
 from sim_vehicles.motion.double_integrator import State
+from sim_vehicles.motion.lagged import inner_of
 from sim_vehicles.motion.sector import SectorBound
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.frames import FRAME_BYTES
@@ -367,6 +369,9 @@ class Fleet:
 
 def prepare(scenario: schema.Scenario) -> None:
     """Compile the kernels before real time begins: fly plain vehicles of a scenario for seconds, logged and not."""
+    if scenario.dynamics == "autopilot":
+        advance(Motion(0j, inner=inner_of(scenario.autopilot)), Target(), scenario.autopilot, 0.02)
+        Fleet(scenario.model_copy(update={"links": Links()}), 0).step((), NS_PER_S)
     plain = {"dynamics": "double_integrator", "links": Links()}
     for recorder in (None, MemoryRecorder()):
         fleet = Fleet(scenario.model_copy(update=plain), 0, recorder=recorder)

@@ -12,27 +12,54 @@ rate of w to the jerk limit. Within a step w is held at its mean. The plain lag 
 import math
 from typing import NamedTuple
 
-from scenarios import schema
+import numpy as np
+from numpy.typing import NDArray
 
-_Line = tuple[tuple[float, complex], ...]
+from scenarios import schema
+from scenarios.hypot import hypot
+from scenarios.kernel import kernel
+
+Line = NDArray[np.complex128]
+"""Delay line (n, 2): accelerations, oldest first, each behind its duration in s."""
+
+
+class Limits(NamedTuple):
+    """What the motion depends on besides the target: see `scenarios.keys.autopilot`. An omitted limit is infinite."""
+
+    lag_s: float
+    acceleration_max_m_s2: float
+    speed_max_m_s: float
+    climb_max_m_s: float
+    drag_1_m: float
+    jerk_max_m_s3: float
+    stiffness_1_s2: float
+    """The square of the natural frequency; 0 for a response of first order."""
 
 
 class Inner(NamedTuple):
     """Internal state of a response besides velocity and acceleration."""
 
+    line: Line
+    """The accelerations aimed at in the last dead time."""
     aimed_m_s2: complex = 0j
     """The acceleration aimed at, within the limits."""
     jerk_m_s3: complex = 0j
     """a' of a second-order response."""
-    line: _Line = ()
-    """Delay line: the accelerations aimed at in the last dead time, oldest first, with their durations in s."""
+
+
+def limits_of(settings: schema.Autopilot) -> Limits:
+    own, stiffness_1_s2 = settings, (settings.natural_frequency_rad_s or 0.0) ** 2
+    return Limits(
+        own.lag_s, own.acceleration_max_m_s2, own.speed_max_m_s, own.climb_max_m_s, own.drag_1_m,
+        own.jerk_max_m_s3 or math.inf, stiffness_1_s2,
+    )  # fmt: skip
 
 
 def inner_of(settings: schema.Autopilot) -> Inner | None:
     """The internal state of a response at rest; None for a plain lag without a jerk limit."""
     if not (settings.dead_time_s or settings.natural_frequency_rad_s or settings.jerk_max_m_s3):
         return None
-    return Inner(line=((settings.dead_time_s, 0j),) if settings.dead_time_s else ())
+    return Inner(np.array([[settings.dead_time_s, 0j]] if settings.dead_time_s else np.empty((0, 2)), np.complex128))
 
 
 def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
@@ -41,65 +68,54 @@ def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
     return max(min(usual_s, settings.dead_time_s or usual_s, fastest_s, settings.lag_s), 1e-3)
 
 
-def followed(
-    inner: Inner, wanted_m_s2: complex, acceleration_m_s2: complex, settings: schema.Autopilot, h: float
-) -> tuple[Inner, complex, complex]:
-    """Internal state and acceleration after a step, and the mean acceleration during it."""
+@kernel
+def aimed_at(wanted_m_s2: complex, before_m_s2: complex, limits: Limits, h: float) -> complex:
+    """The wanted acceleration within the limits, after a step at whose start `before_m_s2` was aimed at."""
     aimed = wanted_m_s2
-    over = length(aimed) / settings.acceleration_max_m_s2
+    over = length(aimed) / limits.acceleration_max_m_s2
     if over > 1.0:
         aimed /= over
-    if settings.jerk_max_m_s3 is not None:
-        change = aimed - inner.aimed_m_s2
-        far = length(change) / (settings.jerk_max_m_s3 * h)
-        if far > 1.0:
-            aimed = inner.aimed_m_s2 + change / far
-    line, acting = inner.line, aimed
-    if line:
-        line, acting = _shifted((*line, (h, aimed)), h)
-    a, jerk = acceleration_m_s2, inner.jerk_m_s3
-    if settings.natural_frequency_rad_s is None:
-        left = math.exp(-h / settings.lag_s)
-        gone = settings.lag_s * (1.0 - left) / h
-        after, mean = acting + (a - acting) * left, acting + (a - acting) * gone
-    else:
-        after, jerk, mean = _second_order(a, jerk, acting, settings, h)
-    return Inner(aimed, jerk, line), after, mean
+    change = aimed - before_m_s2
+    far = length(change) / (limits.jerk_max_m_s3 * h)
+    return before_m_s2 + change / far if far > 1.0 else aimed
 
 
-def _second_order(
-    a: complex, jerk: complex, to: complex, settings: schema.Autopilot, h: float
-) -> tuple[complex, complex, complex]:
-    """a, a' and the mean of a after a step, for a constant input: RK4, whose error at 0.3 rad a step is 2e-5."""
-    square = (settings.natural_frequency_rad_s or 0.0) ** 2
-
-    def curve(a: complex, jerk: complex) -> complex:
-        return square * (to - a - settings.lag_s * jerk)
-
-    half = 0.5 * h
-    c1 = curve(a, jerk)
+@kernel
+def followed(a: complex, jerk: complex, to: complex, limits: Limits, h: float) -> tuple[complex, complex, complex]:
+    """a, a' and the mean of a after a step, for a constant input: by RK4, whose error at 0.3 rad a step is 2e-5."""
+    square = limits.stiffness_1_s2
+    if square == 0.0:
+        left = math.exp(-h / limits.lag_s)
+        gone = limits.lag_s * (1.0 - left) / h
+        return to + (a - to) * left, jerk, to + (a - to) * gone
+    half, lag_s = 0.5 * h, limits.lag_s
+    c1 = square * (to - a - lag_s * jerk)
     a2, j2 = a + half * jerk, jerk + half * c1
-    c2 = curve(a2, j2)
+    c2 = square * (to - a2 - lag_s * j2)
     a3, j3 = a + half * j2, jerk + half * c2
-    c3 = curve(a3, j3)
+    c3 = square * (to - a3 - lag_s * j3)
     a4, j4 = a + h * j3, jerk + h * c3
-    c4 = curve(a4, j4)
+    c4 = square * (to - a4 - lag_s * j4)
     after = a + h / 6.0 * (jerk + 2.0 * (j2 + j3) + j4)
     return after, jerk + h / 6.0 * (c1 + 2.0 * (c2 + c3) + c4), (a + 2.0 * (a2 + a3) + a4) / 6.0
 
 
-def _shifted(line: _Line, h: float) -> tuple[_Line, complex]:
-    """The delay line without its oldest `h` seconds, and the mean acceleration over those."""
+@kernel
+def shifted(line: Line, first: int, end: int, h: float) -> tuple[int, complex]:
+    """Take the oldest `h` seconds from a delay line, which is in these rows: its new first row, and their mean."""
     gained, left_s = 0j, h
-    for first, (duration_s, one) in enumerate(line):
+    for row in range(first, end):
+        duration_s = line[row, 0].real
         taken_s = min(duration_s, left_s)
-        gained += taken_s * one
+        gained += taken_s * line[row, 1]
         left_s -= taken_s
         if duration_s > taken_s + 1e-12:
-            return ((duration_s - taken_s, one), *line[first + 1 :]), gained / h
-    return (), gained / h
+            line[row, 0] = duration_s - taken_s
+            return row, gained / h
+    return end, gained / h
 
 
+@kernel
 def length(vector: complex) -> float:
     """The length of a vector; that of `abs` depends on the C library."""
-    return math.hypot(vector.real, vector.imag)
+    return hypot(vector.real, vector.imag)

@@ -6,7 +6,7 @@ import numpy as np
 
 from scenarios.kernel import Columns, Records
 from sim_vehicles.services.clock import NEVER_NS
-from sim_vehicles.services.frames import GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION, TIMESYNC
+from sim_vehicles.services.frames import ARDUPILOT, GLOBAL_POSITION, HEARTBEAT, LOCAL_POSITION, TIMESYNC
 
 NOBODY = -1
 """Stands for the station's system id where there is no station."""
@@ -16,8 +16,10 @@ NEVER_ASKED = -1
 VEHICLE = np.dtype(
     [
         ("system_id", "i8"), ("wire_id", "i8"),
+        ("copter", "?"),  # else a double integrator
         ("plain", "?"),  # whether kernels may run its common events: `sim_vehicles.vehicles.plain`
-        ("pushed", "?"),  # whether a disturbance pushes it: the craft then moves it before each event that kernels run
+        ("pushed", "?"),  # whether kernels cannot move it: the craft then does, before each event that they run
+        ("version_1", "?"),  # whether it speaks MAVLink 1
         ("acts_ns", "i8"),  # when it next acts if nothing arrives
         ("sequence", "i8"),  # number of the next frame
         ("clock_start_ns", "i8"), ("clock_offset_ns", "i8"), ("clock_drift_ppb", "i8"),  # BootClock
@@ -28,12 +30,17 @@ VEHICLE = np.dtype(
         ("asked_ts1", "i8"),  # of its newest TIMESYNC request
         # Authority
         ("station", "i8"), ("heard_ns", "i8"), ("commanded_ns", "i8"),
-        # FlightMode
+        # FlightMode, or modes of a copter
         ("armed", "?"), ("flying", "?"), ("mode", "i8"), ("stopped", "i8"), ("deadline_ns", "i8"),
+        ("guided_mode", "i8"), ("alarm_ns", "i8"),  # the next event that is neither a report nor a failsafe
         ("setpoint_ns", "i8"), ("setpoint_timeout_ns", "i8"), ("heartbeat_ns", "i8"), ("heartbeat_timeout_ns", "i8"),
         # the double integrator: its State at a time, its Command and its Bounds
         ("state_ns", "i8"), ("state", "f8", (4,)), ("command", "f8", (5,)), ("bounds", "f8", (4,)),
         ("altitude_m", "f8"),
+        # a copter: its Motion at that time, its Target and its Limits; and what makes its set-points and reports
+        ("motion", "f8", (9,)), ("target", "f8", (12,)), ("limits", "f8", (7,)),
+        ("velocity_gain_1_s", "f8"), ("growth", "f8"),
+        ("autopilot", "i8"), ("ready_ns", "i8"), ("origin_neu_m", "f8", (3,)),
         # counts that have not been added to the vehicle's counters yet
         ("setpoints", "i8"), ("heartbeats", "i8"), ("timesync_requests", "i8"), ("timesync_replies", "i8"),
     ],
@@ -56,8 +63,8 @@ class Place(NamedTuple):
 def new_vehicles(n: int) -> Records:
     """Initial records of `VEHICLE` for n vehicles."""
     vehicles = np.zeros(n, VEHICLE)
-    vehicles["station"], vehicles["asked_ts1"] = NOBODY, NEVER_ASKED
-    for name in ("acts_ns", "due_ns", "report_ns", "other_ns", "deadline_ns"):
+    vehicles["station"], vehicles["asked_ts1"], vehicles["autopilot"] = NOBODY, NEVER_ASKED, ARDUPILOT
+    for name in ("acts_ns", "due_ns", "report_ns", "other_ns", "deadline_ns", "alarm_ns"):
         vehicles[name] = NEVER_NS
     return vehicles
 

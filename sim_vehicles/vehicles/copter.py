@@ -12,12 +12,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from scenarios import schema
+from scenarios.kernel import Cell
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import ACTED
 from sim_vehicles.motion.air import Air
-from sim_vehicles.motion.copter import Motion, Target, advance, pair, pushed
+from sim_vehicles.motion.copter import ALTITUDE, Motion, Target, advance, fly_to_at, pair, pushed
 from sim_vehicles.motion.double_integrator import State, state_from
-from sim_vehicles.motion.lagged import inner_of, length
+from sim_vehicles.motion.lagged import inner_of, length, limits_of
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.services import frames, mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
@@ -25,6 +26,7 @@ from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.sitl import slips
 from sim_vehicles.vehicles import copter_rules
+from sim_vehicles.vehicles.flight_mode import set_deadline_at
 from sim_vehicles.vehicles.setpoints import ABSURD, POSITION_AXES, VELOCITY_AXES, YAW_IGNORED, YAW_RATE_IGNORED
 from sim_vehicles.vehicles.shell import Answer, Radio
 
@@ -47,18 +49,25 @@ _ACCEPTED: Answer = mavlink.ACCEPTED, ""
 class Copter:
     """The craft in the shell: its motion and the autopilot's modes."""
 
+    armed = Cell[bool]()
+    flying = Cell[bool]()
+    mode = Cell[int]()
+    _stopped = Cell[bool]()
+    _state_ns, _ready_ns, _alarm_ns = Cell[int](), Cell[int](), Cell[int]()
+    _setpoint_ns = Cell[int | None](NEVER_NS)
+    _setpoint_timeout_ns = Cell[int]()
+    _pushed = Cell[bool]()
+
     def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
         start_ns = radio.start_ns
+        self._vehicles, self._columns, self._row = radio.place
         self.settings = scenario.autopilot
         self.rules = copter_rules.RULES[own.flavour or scenario.autopilot.flavour]
         self.version, self.version_1_first = self.rules.version, self.rules.version_1_first
-        self.is_plain = False
         self.parameters = copter_rules.parameters(self.rules, own.system_id, self.settings)
         self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self.mode = self.rules.first_mode
-        self.armed = self.failsafe = False
-        self.landed = True
         self.home_m = complex(*own.position_ne_m)
         self.motion = Motion(self.home_m, inner=inner_of(self.settings))
         drawn = draws_of(scenario.seed, own.system_id, Use.ORIGIN).random(3)
@@ -70,10 +79,10 @@ class Copter:
         still, exact = scenario.disturbance is None, scenario.navigation is None
         self._air = None if still else Air(scenario, own.system_id, start_ns, radio.recorder)
         self._navigator = None if exact else Navigator(scenario, own.system_id, radio.recorder)
+        self.is_plain = exact and not self.settings.sitl.timesync_back_s
         self._target = Target()
         self._takeoff_m: float | None = None
-        self._motion_ns = start_ns
-        self._setpoint_ns: int | None = None
+        self._state_ns, self._setpoint_ns = start_ns, None
         self._armed_ns = NEVER_NS
         self._read_timeouts()
         self._refusals_left = self.settings.arming_refusals
@@ -83,11 +92,47 @@ class Copter:
         self._jumps = heapq.merge(((*jump, "clock jumped") for jump in jumps), ((*slip, "") for slip in slipping))
         self._jump = next(self._jumps, _NO_JUMP)
         self._complains_ns = start_ns + self._complaint_ns if self.rules.complains_every_s else NEVER_NS
+        for name, value in {
+            "copter": True, "guided_mode": self.rules.guided_mode, "heartbeat_timeout_ns": NEVER_NS,
+            "limits": limits_of(self.settings), "velocity_gain_1_s": self.settings.velocity_gain_1_s,
+            "growth": float(self.rules.velocity_grows), "autopilot": self.rules.autopilot,
+            "origin_neu_m": self.origin_neu_m,
+        }.items():  # fmt: skip
+            self._vehicles[name][self._row] = value
+
+    @property
+    def landed(self) -> bool:
+        return not self.flying
+
+    @property
+    def failsafe(self) -> bool:
+        """Whether set-points have stopped in flight and PX4 holds."""
+        return self._stopped
+
+    @property
+    def motion(self) -> Motion:
+        own = self._vehicles["motion"][self._row].tolist()
+        return Motion(complex(*own[0:2]), complex(*own[2:4]), complex(*own[4:6]), *own[6:], self._inner)
+
+    @motion.setter
+    def motion(self, motion: Motion) -> None:
+        place, velocity, acceleration, *rest, self._inner = motion
+        self._vehicles["motion"][self._row] = *pair(place), *pair(velocity), *pair(acceleration), *rest
+
+    @property
+    def _target(self) -> Target:
+        own = self._vehicles["target"][self._row].tolist()
+        return Target(complex(*own[0:2]), complex(*own[2:4]), *own[4:10], complex(*own[10:]))
+
+    @_target.setter
+    def _target(self, target: Target) -> None:
+        acceleration, velocity, *rest, place = target
+        self._vehicles["target"][self._row] = *pair(acceleration), *pair(velocity), *rest, *pair(place)
 
     def state_at(self, time_ns: int) -> State:
         """The true state in the scenario's frame at a time after the last event, if nothing arrives until then."""
         motion = self.motion
-        if not self.landed and time_ns > self._motion_ns:
+        if self.flying and time_ns > self._state_ns:
             motion, _ = self._flown(time_ns, foreseen=True)
         return state_from(pair(motion.place_m), pair(motion.velocity_m_s))
 
@@ -95,13 +140,15 @@ class Copter:
 
     @property
     def deadline_ns(self) -> int:
-        """Time of the next event that is not a report."""
-        deadline_ns = min(self._jump[0], self._complains_ns)
-        if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
-            deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
+        """Time of the next event that is not a report. Noted for kernels, like whether they may move the copter."""
+        ends = self._takeoff_m is not None or self.mode in (self.rules.land_mode, self.rules.return_mode)
+        self._pushed = ends or self._air is not None or self._inner is not None
+        alarm_ns = min(self._jump[0], self._complains_ns)
         if self.armed and self.landed:
-            deadline_ns = min(deadline_ns, self._armed_ns + self._ground_disarm_ns)
-        return deadline_ns
+            alarm_ns = min(alarm_ns, self._armed_ns + self._ground_disarm_ns)
+        self._alarm_ns = alarm_ns
+        set_deadline_at(self._vehicles, self._row)
+        return self._columns["deadline_ns"][self._row]
 
     def happen(self, time_ns: int) -> None:
         """Run the event at the deadline: a clock jump, a complaint, disarming on the ground, or lost set-points."""
@@ -130,9 +177,9 @@ class Copter:
     def _lose_setpoints(self, time_ns: int) -> None:
         """Stop: ArduCopter stays in guided mode, PX4 leaves offboard and holds."""
         self._setpoint_ns = None
-        self._target = self._stopped()
+        self._target = self._own_target()
         if self.rules.guided_mode != self.rules.takeoff_mode:
-            self.mode, self.failsafe = self.rules.hold_mode, True
+            self.mode, self._stopped = self.rules.hold_mode, True
         self._radio.tell(time_ns, "set-points stopped")
         self._radio.say(time_ns, "No offboard signal" if self.failsafe else "Guided: no set-points, stopping")
 
@@ -141,7 +188,7 @@ class Copter:
     def acts_at(self, time_ns: int) -> int:
         """When a message that arrives at `time_ns` acts, in ns: never before one that has already acted."""
         self.move(time_ns)
-        return self._motion_ns
+        return self._state_ns
 
     def hear_heartbeat(self, time_ns: int) -> None: ...  # without effect
 
@@ -153,13 +200,16 @@ class Copter:
         )
         guided = self.mode == self.rules.guided_mode
         if reason:
-            if guided and self.rules.velocity_grows and not self.landed:
-                self._takeoff_m, self._target = None, self._stopped()  # ArduCopter stops at a set-point that it refuses
+            if guided and self.rules.velocity_grows and self.flying:
+                self._takeoff_m, self._target = (
+                    None,
+                    self._own_target(),
+                )  # ArduCopter stops at a set-point that it refuses
             return reason
         self._setpoint_ns = time_ns  # PX4 also counts those before offboard: they allow it to enter that mode
         if not guided or not self.armed:
             return "ignored_not_guided" if not guided else "ignored_not_armed"
-        if not self.landed:
+        if self.flying:
             self._takeoff_m = None  # a set-point ends a guided take-off at the present altitude
             self._target = target
             self._radio.record(ACTED, setpoint.time_boot_ms, time_ns)
@@ -198,7 +248,7 @@ class Copter:
 
     def _arm(self, command: mavlink.Command, time_ns: int) -> Answer:
         if command.param1 == 0.0:
-            if not self.landed:
+            if self.flying:
                 return copter_rules.FAILED, ""
             self.armed = False
             return _ACCEPTED
@@ -212,7 +262,7 @@ class Copter:
         self.armed, self._armed_ns = True, time_ns
         self._radio.tell(time_ns, "armed")
         if self._takeoff_m is not None:
-            self._leave_ground(time_ns)
+            self._leave_ground(self._takeoff_m, time_ns)
         return _ACCEPTED
 
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
@@ -226,8 +276,8 @@ class Copter:
         streamed = self._setpoint_ns is not None and time_ns - self._setpoint_ns < self._setpoint_timeout_ns
         if mode == self.rules.guided_mode != self.rules.takeoff_mode and not streamed:
             return copter_rules.TEMPORARILY_REJECTED, "Offboard needs set-points"
-        self.mode, self.failsafe, self._takeoff_m = mode, False, None
-        self._target = self._stopped()
+        self.mode, self._stopped, self._takeoff_m = mode, False, None
+        self._target = self._own_target()
         if mode == self.rules.guided_mode == self.rules.takeoff_mode:
             self._setpoint_ns = time_ns  # the timeout starts with the mode
         self._radio.tell(time_ns, self.rules.modes[mode])
@@ -247,7 +297,7 @@ class Copter:
             return copter_rules.FAILED if own_mode else copter_rules.TEMPORARILY_REJECTED
         self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
         if self.armed:
-            self._leave_ground(time_ns)
+            self._leave_ground(altitude_m, time_ns)
         return mavlink.ACCEPTED
 
     # What it sends
@@ -258,7 +308,7 @@ class Copter:
         origin_north_m, origin_east_m, origin_up_m = self.origin_neu_m
         boot_ms &= frames.UINT32
         if message_id == frames.HEARTBEAT:
-            kind, flying = self.rules.autopilot, not self.landed
+            kind, flying = self.rules.autopilot, self.flying
             return encoder.heartbeat(self.mode, armed=self.armed, flying=flying, critical=self.failsafe, autopilot=kind)
         if message_id == frames.LOCAL_POSITION and ready:
             down_m = origin_up_m - motion.altitude_m
@@ -286,7 +336,7 @@ class Copter:
     @property
     def _steers(self) -> bool:
         """Whether it follows set-points, or hovers because they have stopped."""
-        return self.mode == self.rules.guided_mode and not self.landed and self._takeoff_m is None
+        return self.mode == self.rules.guided_mode and self.flying and self._takeoff_m is None
 
     def _active_target(self, boot_ms: int) -> messages.Message:
         """Its target as it reports it: the velocity and the acceleration of the set-point.
@@ -316,57 +366,59 @@ class Copter:
             ORIGIN_ALTITUDE_M + motion.altitude_m,
             (*pair(motion.velocity_m_s), -motion.climb_m_s),
             (roll_rad, pitch_rad, motion.yaw_rad),
-            flying=not self.landed,
+            flying=self.flying,
             has_position=has_position,
         )
 
     # Motion
 
-    def _stopped(self) -> Target:
+    def _own_target(self) -> Target:
         """The target of a mode without set-points: stop, sink, or fly home."""
-        gain, place = self.settings.velocity_gain_1_s, self.home_m if self.mode == self.rules.return_mode else None
         climb_m_s = -SINK_FAST_M_S if self.mode == self.rules.land_mode else 0.0
-        return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_m=place)
+        target = Target(velocity_gain_1_s=self.settings.velocity_gain_1_s, climb_m_s=climb_m_s)
+        return target._replace(place_m=self.home_m) if self.mode == self.rules.return_mode else target
 
-    def _leave_ground(self, time_ns: int) -> None:
-        self.landed = False
-        self._target = self._stopped()._replace(altitude_m=self._takeoff_m)
+    def _leave_ground(self, altitude_m: float, time_ns: int) -> None:
+        self.flying = True
+        self._target = self._own_target()._replace(altitude_m=altitude_m)
         self._setpoint_ns = None
         self._radio.tell(time_ns, "takes off")
 
     def _flown(self, time_ns: int, *, foreseen: bool = False) -> tuple[Motion, Target]:
         """Motion and target at a later time."""
         if self._air is None:
-            return advance(self.motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
+            return advance(self.motion, self._target, self.settings, (time_ns - self._state_ns) / NS_PER_S)
         own = self.motion, self._target
-        for piece in self._air.pieces(self._motion_ns, time_ns, foreseen=foreseen):
+        for piece in self._air.pieces(self._state_ns, time_ns, foreseen=foreseen):
             own = pushed(*own, self.settings, piece)
         return own
 
     def move(self, time_ns: int) -> None:
-        if time_ns <= self._motion_ns:
+        if time_ns <= self._state_ns:
             return
-        if not self.landed:
+        if self.flying and (self._air is not None or self._inner is not None):
             self.motion, self._target = self._flown(time_ns)
-        self._motion_ns = time_ns
+            self._state_ns = time_ns
+        else:
+            fly_to_at(self._vehicles, self._row, time_ns)
         if self.landed:
             return
-        altitude_m = self.motion.altitude_m
+        altitude_m = self._columns["motion"][self._row, ALTITUDE]
         if self._takeoff_m is not None and altitude_m > self._takeoff_m - TAKEN_OFF_M:
             self._takeoff_m = None
             if self.rules.takeoff_mode != self.rules.guided_mode:
                 self.mode = self.rules.hold_mode
-                self._target = self._stopped()
+                self._target = self._own_target()
             self._radio.tell(time_ns, "taken off")
         elif self.mode == self.rules.land_mode:
             sink = SINK_M_S if altitude_m < SINK_SLOWLY_BELOW_M else SINK_FAST_M_S
             self._target = self._target._replace(climb_m_s=-sink)
             if altitude_m <= 0.0:
-                self.landed, self.armed = True, False
+                self.flying = self.armed = False
                 where_m, yaw_rad = self.motion.place_m, self.motion.yaw_rad
                 self.motion = Motion(where_m, yaw_rad=yaw_rad, inner=inner_of(self.settings))
                 self._radio.tell(time_ns, "landed")
         elif self.mode == self.rules.return_mode and length(self.motion.place_m - self.home_m) < HOME_M:
             self.mode = self.rules.land_mode
-            self._target = self._stopped()
+            self._target = self._own_target()
             self._radio.tell(time_ns, self.rules.modes[self.mode])

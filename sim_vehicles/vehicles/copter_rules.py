@@ -150,9 +150,10 @@ def setpoint_target(
     setpoint = setpoints.to_local(setpoint, yaw_rad)
     acceleration = setpoint.acceleration_ned_m_s2 if acceleration_counts else (0.0, 0.0, 0.0)
     velocity = setpoint.velocity_ned_m_s if velocity_counts else (0.0, 0.0, 0.0)
-    yaw = None if mask & setpoints.YAW_IGNORED else setpoint.yaw_rad
+    has_yaw = not mask & setpoints.YAW_IGNORED
+    yaw = setpoint.yaw_rad if has_yaw else 0.0
     rate = 0.0 if mask & setpoints.YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
-    if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= setpoints.ABSURD:
+    if not math.hypot(*acceleration, *velocity, yaw, rate) <= setpoints.ABSURD:
         return "refused_absurd", Target()
     return "", Target(
         complex(*acceleration[:2]),
@@ -160,7 +161,7 @@ def setpoint_target(
         velocity_gain_1_s=velocity_gain_1_s if velocity_counts else 0.0,
         growth=1.0 if velocity_counts and rules.velocity_grows else 0.0,
         climb_m_s=-velocity[2],
-        yaw_rad=yaw,
+        yaw_rad=yaw if has_yaw else math.nan,
         yaw_rate_rad_s=rate,
     )
 

@@ -25,7 +25,7 @@ _STOPPED = ("", "set-points", "station heartbeat")
 @kernel
 def takes_setpoints(vehicle: Record) -> bool:
     """Whether the vehicle flies and obeys set-points."""
-    return vehicle.flying and vehicle.armed and vehicle.mode == MODE_GUIDED and vehicle.stopped == 0
+    return vehicle.flying and vehicle.armed and vehicle.mode == vehicle.guided_mode and vehicle.stopped == 0
 
 
 @kernel
@@ -45,16 +45,17 @@ def note_heartbeat(vehicle: Record, now_ns: int) -> None:
 
 @kernel
 def set_deadline(vehicle: Record) -> None:
+    vehicle.deadline_ns = vehicle.alarm_ns
     if not vehicle.flying or vehicle.stopped != 0:
-        vehicle.deadline_ns = NEVER_NS
         return
-    vehicle.deadline_ns = vehicle.heartbeat_ns + vehicle.heartbeat_timeout_ns
-    if vehicle.mode == MODE_GUIDED and vehicle.setpoint_ns != NEVER_NS:  # a commanded hold needs no set-points
+    if vehicle.heartbeat_timeout_ns != NEVER_NS:
+        vehicle.deadline_ns = min(vehicle.deadline_ns, vehicle.heartbeat_ns + vehicle.heartbeat_timeout_ns)
+    if vehicle.mode == vehicle.guided_mode and vehicle.setpoint_ns != NEVER_NS:  # a hold needs no set-points
         vehicle.deadline_ns = min(vehicle.deadline_ns, vehicle.setpoint_ns + vehicle.setpoint_timeout_ns)
 
 
 _note_setpoint_at, _note_heartbeat_at = at_row(note_setpoint), at_row(note_heartbeat)
-_set_deadline_at = at_row(set_deadline)
+set_deadline_at = at_row(set_deadline)
 
 
 class FlightMode:
@@ -70,10 +71,11 @@ class FlightMode:
     _setpoint_timeout_ns = Cell[int]()
     _heartbeat_ns = Cell[int]()
     _heartbeat_timeout_ns = Cell[int]()
+    _guided_mode = Cell[int]()
 
     def __init__(self, safety: Safety, place: Place) -> None:
         self._vehicles, self._columns, self._row = place
-        self.mode = MODE_STABILIZE
+        self.mode, self._guided_mode = MODE_STABILIZE, MODE_GUIDED
         self._setpoint_timeout_ns = round(safety.setpoint_timeout_s * NS_PER_S)
         self._heartbeat_timeout_ns = round(safety.heartbeat_timeout_s * NS_PER_S)
 
@@ -148,4 +150,4 @@ class FlightMode:
         self._set_deadline()
 
     def _set_deadline(self) -> None:
-        _set_deadline_at(self._vehicles, self._row)
+        set_deadline_at(self._vehicles, self._row)

@@ -1,22 +1,22 @@
 """Runs the common events of plain vehicles in kernels: the station's set-points, heartbeats and TIMESYNC, and reports.
 
-A plain craft is a double integrator whose set-points act at once, and which reports its true state (`Craft.is_plain`).
+The set-points of a plain craft act at once, and it reports its true state (`Craft.is_plain`).
 If its links are plain, too (`Link.plain`), a kernel runs its events in order of time, as `Shell` does, and stops before
 one that takes Python.
 """
 
-from math import copysign, cos, pi, sin, tau
+from math import cos, nan, pi, sin
 
 from scenarios.kernel import Record, Records, kernel
 from scenarios.sockets import Bytes, Ints
 from sim_vehicles.links.links import row_of
 from sim_vehicles.links.queue import copy_bytes, enter, free, new_entry, ready, record_datagram, take, take_in
 from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, PASSED, SAMPLED, can_record, note
+from sim_vehicles.motion.copter import ALTITUDE, CLIMB, YAW, Target, fly_to, is_led, set_target, within_half_a_turn
 from sim_vehicles.motion.double_integrator import Command, advance_to, set_command, state_of
 from sim_vehicles.services.clock import NEVER_NS, boot_ns
 from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.frames import (
-    ARDUPILOT,
     AUTOPILOT,
     FRAME_BYTES,
     GLOBAL_POSITION,
@@ -42,11 +42,20 @@ from sim_vehicles.services.hot import REPORTS
 from sim_vehicles.services.mavlink import MODE_GUIDED
 from sim_vehicles.services.schedule import schedule_report
 from sim_vehicles.vehicles.flight_mode import note_heartbeat, note_setpoint, takes_setpoints
-from sim_vehicles.vehicles.setpoints import ABSURD, ACCELERATION, AXES, FORCE_SET
+from sim_vehicles.vehicles.setpoints import (
+    ABSURD,
+    ACCELERATION,
+    AXES,
+    FORCE_SET,
+    VELOCITY_ACCELERATION,
+    YAW_IGNORED,
+    YAW_RATE_IGNORED,
+)
 
 NEEDS_PYTHON, MOVE_FIRST, SILENT = -2, -1, 0
 """Returned in place of a frame's size. NEEDS_PYTHON, MOVE_FIRST: nothing was done; the event takes Python, or the
 craft must move first. SILENT: done, with no frame to send."""
+_NO_TURN = YAW_IGNORED | YAW_RATE_IGNORED
 _SETPOINT_BYTES, _HEARTBEAT_BYTES = 53, 9
 """Sizes of complete payloads: common set-points and heartbeats do not end in zeros."""
 
@@ -58,9 +67,17 @@ def _must_move(vehicle: Record, time_ns: int) -> bool:
 
 
 @kernel
+def _move(vehicle: Record, time_ns: int) -> None:
+    if vehicle.copter:
+        fly_to(vehicle, time_ns)
+    else:
+        advance_to(vehicle, time_ns)
+
+
+@kernel
 def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame, truth: Records) -> int:
     """Act on a datagram that arrives; returns the size of the answer, SILENT, NEEDS_PYTHON or MOVE_FIRST."""
-    number = frequent_message(frame, size)
+    number = NEEDS_PYTHON if vehicle.version_1 else frequent_message(frame, size)
     if number == SETPOINT:
         return _take_setpoint(vehicle, frame, time_ns, truth)
     if number == HEARTBEAT:
@@ -70,25 +87,42 @@ def hear(vehicle: Record, frame: Frame, size: int, time_ns: int, answer: Frame, 
 
 @kernel
 def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) -> int:
-    """Fly an acceleration that the station commands in flight."""
+    """Fly the acceleration that the station commands in flight or, of a copter, velocity and acceleration."""
     if frame[1] != _SETPOINT_BYTES or frame[5] != vehicle.station or not takes_setpoints(vehicle):
         return NEEDS_PYTHON
-    mask, component = read_uint16(frame, PAYLOAD + 48), frame[PAYLOAD + 51]
-    if mask & (AXES | FORCE_SET) != ACCELERATION or frame[PAYLOAD + 52] != LOCAL_NED:
+    mask, component, judged, counted = (
+        read_uint16(frame, PAYLOAD + 48),
+        frame[PAYLOAD + 51],
+        AXES | FORCE_SET,
+        ACCELERATION,
+    )
+    if vehicle.copter:
+        judged, counted = judged | _NO_TURN, VELOCITY_ACCELERATION | _NO_TURN
+    if mask & judged != counted or frame[PAYLOAD + 52] != LOCAL_NED or (vehicle.copter and is_led(vehicle)):
         return NEEDS_PYTHON
     if frame[PAYLOAD + 50] != vehicle.wire_id or component not in (0, AUTOPILOT):
         return NEEDS_PYTHON
     north, east = read_float(frame, PAYLOAD + 28), read_float(frame, PAYLOAD + 32)
-    down = read_float(frame, PAYLOAD + 36)
-    if not abs(north) + abs(east) + abs(down) <= ABSURD:  # also if NaN
+    down, velocity, climb = read_float(frame, PAYLOAD + 36), 0j, 0.0
+    if vehicle.copter:
+        velocity = complex(read_float(frame, PAYLOAD + 16), read_float(frame, PAYLOAD + 20))
+        climb = -read_float(frame, PAYLOAD + 24)
+    size = abs(north) + abs(east) + abs(down) + abs(velocity.real) + abs(velocity.imag) + abs(climb)
+    if not size <= ABSURD:  # also if NaN
         return NEEDS_PYTHON
     acts_ns = max(time_ns, vehicle.state_ns)
     if _must_move(vehicle, acts_ns):
         return MOVE_FIRST
     vehicle.heard_ns = vehicle.commanded_ns = time_ns
     note_setpoint(vehicle, acts_ns)
-    advance_to(vehicle, acts_ns)
-    set_command(vehicle, Command(north, east, 0.0, 0.0, 0.0))
+    _move(vehicle, acts_ns)
+    if vehicle.copter:
+        acceleration, gain, growth = complex(north, east), vehicle.velocity_gain_1_s, vehicle.growth
+        set_target(
+            vehicle, Target(acceleration, velocity, gain, growth, climb, nan, nan, 0.0, complex(nan, nan))
+        )  # fmt: skip
+    else:
+        set_command(vehicle, Command(north, east, 0.0, 0.0, 0.0))
     vehicle.setpoints += 1
     key = read_int64(frame, PAYLOAD, 4)  # its sender's time_boot_ms
     note(truth, ACTED, vehicle.system_id, key, acts_ns, acts_ns, acts_ns, PASSED, 0)
@@ -124,41 +158,56 @@ def _take_timesync(vehicle: Record, frame: Frame, time_ns: int, answer: Frame) -
 
 
 @kernel
-def report(vehicle: Record, frame: Frame, truth: Records) -> int:
-    """Make the next report, before any other event, and schedule the one after it; returns as `hear`."""
-    k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
-    if REPORTS[k] == LOCAL_POSITION or REPORTS[k] == GLOBAL_POSITION:
-        if _must_move(vehicle, time_ns):
-            return MOVE_FIRST
-        advance_to(vehicle, time_ns)
+def _flown(vehicle: Record) -> tuple[float, float, float, float, float, float, float]:
+    """Position north and east, altitude; velocity north, east and down; and yaw."""
+    if vehicle.copter:
+        own = vehicle.motion
+        return own[0], own[1], own[ALTITUDE], own[2], own[3], -own[CLIMB], own[YAW]
     north, east, yaw, speed = state_of(vehicle)
-    heading = _within_half_a_turn(yaw)
-    if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
-        return NEEDS_PYTHON
-    schedule_report(vehicle, k, vehicle.number[k] + 1)
-    if REPORTS[k] == TIMESYNC:
-        clock = vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb
-        vehicle.asked_ts1 = boot_ns(clock[0], clock[1], clock[2], time_ns)
-        return timesync(vehicle, frame, 0, vehicle.asked_ts1)
-    if REPORTS[k] == HEARTBEAT:
-        mode, critical = vehicle.mode, vehicle.stopped != 0
-        return heartbeat(vehicle, frame, mode, ARDUPILOT, vehicle.armed, mode == MODE_GUIDED, vehicle.flying, critical)
-    v_north, v_east = speed * cos(yaw), speed * sin(yaw)
-    if REPORTS[k] == LOCAL_POSITION:
-        note(truth, SAMPLED, vehicle.system_id, boot_ms & UINT32, time_ns, time_ns, time_ns, PASSED, 0)
-        return local_position(vehicle, frame, boot_ms, north, east, -vehicle.altitude_m, v_north, v_east, 0.0)
-    latitude_deg, longitude_deg = degrees(north, east)
-    altitude_m = ORIGIN_ALTITUDE_M + vehicle.altitude_m
-    return global_position(
-        vehicle, frame, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, 0.0, heading
-    )  # fmt: skip
+    return north, east, vehicle.altitude_m, speed * cos(yaw), speed * sin(yaw), 0.0, within_half_a_turn(yaw)
 
 
 @kernel
-def _within_half_a_turn(angle: float) -> float:
-    """`math.remainder(angle, tau)`, which Numba lacks, to the same bits except the sign of exactly half a turn."""
-    over = abs(angle) % tau
-    return copysign(1.0, angle) * (over if over <= tau - over else over - tau)
+def _status(vehicle: Record, number: int, frame: Frame, time_ns: int) -> int:
+    """Make a TIMESYNC request or a HEARTBEAT."""
+    mode, critical = vehicle.mode, vehicle.stopped != 0
+    if number == HEARTBEAT:
+        guided = mode == MODE_GUIDED and not vehicle.copter
+        return heartbeat(vehicle, frame, mode, vehicle.autopilot, vehicle.armed, guided, vehicle.flying, critical)
+    clock = vehicle.clock_start_ns, vehicle.clock_offset_ns, vehicle.clock_drift_ppb
+    vehicle.asked_ts1 = boot_ns(clock[0], clock[1], clock[2], time_ns)
+    return timesync(vehicle, frame, 0, vehicle.asked_ts1)
+
+
+@kernel
+def report(vehicle: Record, frame: Frame, truth: Records) -> int:
+    """Make the next report, before any other event, and schedule the one after it; returns as `hear`."""
+    k, time_ns, boot_ms = vehicle.report, vehicle.report_ns, vehicle.due_ms[vehicle.report]
+    has_position = REPORTS[k] == LOCAL_POSITION or REPORTS[k] == GLOBAL_POSITION
+    if vehicle.version_1 or (has_position and time_ns < vehicle.ready_ns):
+        return NEEDS_PYTHON
+    if has_position or vehicle.copter:
+        if _must_move(vehicle, time_ns):
+            return MOVE_FIRST
+        _move(vehicle, time_ns)
+    north, east, altitude_m, v_north, v_east, v_down, heading = _flown(vehicle)
+    if REPORTS[k] == GLOBAL_POSITION and not -pi < heading < pi:
+        return NEEDS_PYTHON
+    schedule_report(vehicle, k, vehicle.number[k] + 1)
+    if not has_position:
+        return _status(vehicle, REPORTS[k], frame, time_ns)
+    if REPORTS[k] == LOCAL_POSITION:
+        note(truth, SAMPLED, vehicle.system_id, boot_ms & UINT32, time_ns, time_ns, time_ns, PASSED, 0)
+        origin = vehicle.origin_neu_m
+        north, east, down = north - origin[0], east - origin[1], -altitude_m
+        if vehicle.copter:
+            down = origin[2] - altitude_m  # not for others: 0 - 0 has another sign bit than -0, and that is sent
+        return local_position(vehicle, frame, boot_ms, north, east, down, v_north, v_east, v_down)
+    latitude_deg, longitude_deg = degrees(north, east)
+    altitude_m += ORIGIN_ALTITUDE_M
+    return global_position(
+        vehicle, frame, boot_ms, latitude_deg, longitude_deg, altitude_m, v_north, v_east, v_down, heading
+    )  # fmt: skip
 
 
 @kernel

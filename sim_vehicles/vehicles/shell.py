@@ -114,8 +114,8 @@ class Craft(Protocol):
     version: tuple[int, int, int]
     """The version that AUTOPILOT_VERSION reports."""
     is_plain: bool
-    """Whether it is a double integrator whose set-points act at once, and which reports its true state. Then kernels
-    run its common events, see `plain`."""
+    """Whether its set-points act at once, and it reports its true state. Then kernels run its common events, see
+    `plain`."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does."""
     intervals_us: Mapping[int, int]
@@ -146,6 +146,7 @@ class Shell(Generic[Flown]):
     """A vehicle as its link sees it. `experiment` is the text of its parameter SCENARIO."""
 
     _asked_ts1 = Cell[int]()
+    _version_1 = Cell[bool]()
 
     def __init__(
         self, scenario: schema.Scenario, radio: Radio, craft: Flown, *, signed: bool = False, experiment: str = ""
@@ -156,7 +157,7 @@ class Shell(Generic[Flown]):
         _, self._columns, self._row = radio.place
         self.changes = radio.changes
         self.authority = Authority(radio.place, scenario.safety.heartbeat_timeout_s)
-        self._speaks_version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
+        self._version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
         self._frames = np.zeros((2, FRAME_BYTES), np.uint8)
         """A datagram, and the frame that a kernel makes."""
         self._backdating_ns = backdating_ns(scenario, radio.system_id)
@@ -210,7 +211,7 @@ class Shell(Generic[Flown]):
                 self._report(*schedule.pop())
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
-        if self._speaks_version_1 and message_id != frames.HEARTBEAT:
+        if self._version_1 and message_id != frames.HEARTBEAT:
             return  # no station has been heard that could want it
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
@@ -223,7 +224,7 @@ class Shell(Generic[Flown]):
             own = craft.report(message_id, time_ns, boot_ms)
             if own is None:
                 return
-            frame = mavlink.in_version_1(own) if self._speaks_version_1 else own
+            frame = mavlink.in_version_1(own) if self._version_1 else own
             if message_id == frames.LOCAL_POSITION:
                 radio.record(SAMPLED, boot_ms, time_ns)
         radio.send(frame, time_ns)
@@ -247,7 +248,7 @@ class Shell(Generic[Flown]):
                 return
         counters, authority = self.radio.counters, self.authority
         for source, message in mavlink.read_datagram(data, counters):
-            self._speaks_version_1 = False
+            self._version_1 = False
             if isinstance(message, mavlink.Heartbeat):
                 self._take_heartbeat(source, message, time_ns)
             elif isinstance(message, mavlink.Timesync):
