@@ -115,7 +115,7 @@ class AutopilotFleet(Fleet):
     def locate(self, history: StateHistory) -> None:
         """Update the origins of the local frames. States reported before their frame moved are dropped."""
         first = next(start for start, vehicle in zip(self.starts, self.vehicles, strict=True) if not vehicle.left_out)
-        frames = [first, *((startup.origin, startup.origin_altitude_m) for startup in self.starts)]
+        frames: list[object] = [first, *((startup.origin, startup.origin_altitude_m) for startup in self.starts)]
         if frames == self._frames:
             return
         self._frames = frames if all(startup.origin for startup in self.starts) else []

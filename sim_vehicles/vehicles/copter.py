@@ -112,7 +112,7 @@ class Copter:
     @property
     def motion(self) -> Motion:
         own = self._vehicles["motion"][self._row].tolist()
-        return Motion(complex(*own[0:2]), complex(*own[2:4]), complex(*own[4:6]), *own[6:], self._inner)
+        return Motion(complex(*own[0:2]), complex(*own[2:4]), complex(*own[4:6]), *own[6:], inner=self._inner)
 
     @motion.setter
     def motion(self, motion: Motion) -> None:
@@ -122,7 +122,7 @@ class Copter:
     @property
     def _target(self) -> Target:
         own = self._vehicles["target"][self._row].tolist()
-        return Target(complex(*own[0:2]), complex(*own[2:4]), *own[4:10], complex(*own[10:]))
+        return Target(complex(*own[0:2]), complex(*own[2:4]), *own[4:10], place_m=complex(*own[10:]))
 
     @_target.setter
     def _target(self, target: Target) -> None:
