@@ -54,7 +54,7 @@ def senders(folder: Path, network: int) -> set[int]:
     "real_time",
     [False, pytest.param(True, marks=[pytest.mark.realtime, pytest.mark.xdist_group("realtime")])],
 )
-def test_vehicles_of_the_same_id_fly_in_networks_of_their_own(real_time: bool, tmp_path: Path) -> None:
+def test_vehicles_of_the_same_id_fly_in_their_own_networks(real_time: bool, tmp_path: Path) -> None:
     flight = fly_plan(planned(renumbered(2.0)), tmp_path / "run", real_time=real_time)
     assert flight.events[-1].text == "completed: duration reached"
     flown = flight.ticks[flight.ticks["time_s"] > 1.0]

@@ -75,7 +75,7 @@ def test_spacing_gain_is_where_feedback_of_it_destabilises() -> None:
     assert abscissa(1.001 / gain) > 0.0 > abscissa(0.999 / gain)
 
 
-def test_spacing_gain_without_delay_is_that_of_the_bounded_real_lemma() -> None:
+def test_spacing_gain_without_delay_is_that_of_bounded_real_lemma() -> None:
     figures = LoopFigures(PAIR, K, FlownTiming(np.inf, 0.02))
     C, A, B = np.array([[0.0, 1.0, 0.0]]), PAIR.A + PAIR.B @ K, PAIR.B
 
