@@ -19,8 +19,12 @@ PUBLIC_MODULES = [name for name in MODULES if "._" not in name]
 # Functions of public modules that other modules of `gains` or gcs alone call, and that tests judge by known answers. A
 # new function is not among them and so needs an example.
 INTERNAL_FUNCTIONS = {
+    "gains.core.arrays.matrix_exponentials",
     "gains.core.arrays.spectral_norms",
     "gains.core.requirement.plain",
+    "gains.core.semidefinite.negative",
+    "gains.core.semidefinite.positive_definite_solution",
+    "gains.core.semidefinite.solved",
     "gains.core.structure.balanced",
     "gains.core.structure.block_diagonal",
     "gains.core.structure.distinct_blocks",

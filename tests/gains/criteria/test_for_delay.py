@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.requirement import Criteria, Requirement
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.core.structure import roots_of
 from gains.criteria.figures import LoopFigures, pole_region
 from gains.design.design import design

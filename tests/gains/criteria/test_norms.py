@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.criteria.figures import LoopFigures
 from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.rightmost import rightmost_root
