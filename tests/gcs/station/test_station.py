@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs.link.datagram import Datagram, Outgoing, address_at
+from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.startup import WITHOUT_TARGET
 from gcs.link.vehicle import told_by
 from gcs.plan.flight_plan import FlightPlan
@@ -16,7 +16,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import Control
 from tests.support.paths import SCENARIOS
-from tests.support.station_peer import HOME, Peer, messages
+from tests.support.station_peer import HOME, Peer, address_at, messages
 
 S, MS = 1_000_000_000, 1_000_000
 SCENARIO = load(SCENARIOS / "chain3.toml")
