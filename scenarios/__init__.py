@@ -1,5 +1,6 @@
 """The definition of an experiment. `schema` and `keys` define its keys, `files` reads and checks them, `shipped` finds
 the scenarios that ship, `networks` numbers vehicles, `signing` signs links.
 
-`kernel` with `kernel_cache` and `handle`, `sockets`, `undisturbed`, `hypot`, `errors` and `networks` are here because
-station and vehicles share them: neither package may import the other."""
+There are more than twelve files because this package also has what station and vehicles share, neither of which may
+import the other: `kernel` with `kernel_cache` and `handle`, `sockets`, `undisturbed`, `hypot`, `errors`, `networks`.
+"""

@@ -29,7 +29,7 @@ class ScenarioError(Exception):
 
 
 class UnreadableError(ScenarioError):
-    """The named file is missing, unreadable, empty or no text."""
+    """The named file is missing, unreadable, empty or not text."""
 
     def __init__(self, path: Path, read: str, wanted: str = "") -> None:
         run = path / "scenario.toml"

@@ -111,7 +111,10 @@ def with_line(fault: str, file: Path) -> str:
 
 
 def dump(scenario: Scenario) -> str:
-    """The scenario as TOML text that `parse` reads back to an equal object, beside `scenarios.own_code.write_code`."""
+    """The scenario as TOML text that `parse` reads back to an equal object.
+
+    The text only names the user's own code: `scenarios.own_code.write_code` writes it.
+    """
     return toml_text(as_flown(scenario).model_dump(mode="json", exclude_none=True, exclude={"code"}))
 
 

@@ -13,7 +13,7 @@ _WITHOUT_DELAY = "damping_min", "natural_frequency_max_rad_s"
 
 
 def response_wanted(dynamics: str) -> str:
-    """Wording for a missing response in errors: what is wanted, and where its values are found."""
+    """What an error about a missing response says is wanted, and where its values are found."""
     found = "a flight leaves in design.json" if dynamics == "autopilot" else "gcs identify finds"
     return f"a [response], which {found}"
 

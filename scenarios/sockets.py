@@ -94,7 +94,7 @@ def stamped(own: socket.socket) -> socket.socket:
 
 
 class Buffers(NamedTuple):
-    """What kernels read into: see `Batch`, whose rows are the first ones of `table`, and the words."""
+    """The arrays into which kernels read: a `Batch` is made of the first columns of `table`; then the words."""
 
     stream: Bytes
     table: Ints

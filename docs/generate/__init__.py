@@ -8,5 +8,6 @@ A page is written by hand and holds blocks, which are filled in between two comm
 `blocks` finds and fills them. `reference` makes those of the reference (with `keys` and `api`), and
 `measurements` those with figures, which it lists. `__main__` is the command behind `python3 make.py reference`
 and `measurements`. `pictures` makes the pictures. `runner` runs the commands behind figures and pages, in processes
-that `forked` makes from one that is `preloaded`. The other files each make one kind of block.
+that `forked` makes from one that is `preloaded`; `sessions` finds what a page says to type. The other files each
+make one kind of block: hence more than twelve.
 """

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from gains.core._semidefinite import SolverFacts, solved
 from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
+from gains.core.semidefinite import SolverFacts, solved
 from gains.core.structure import roots_of
 from gains.formation.pattern import Pattern, Plant, check_fits
 

@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 from scipy import linalg
 
-from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.core.requirement import Requirement, plain
+from gains.core.semidefinite import SolverFacts
 from gains.delay.constant import delay_margin
 from gains.design.dk_iteration import DecayProof, abscissa, decay_proof, dk_iteration
 from gains.design.for_delay import PatternGains, searched

@@ -82,7 +82,7 @@ def predicted_gains(
     the true delays `at_s`; None means no mismatch. Without a `response`, vehicles respond at once. Raises
     InfeasibleError as `searched` does.
 
-    With a mismatch of 20 % to either side of 0.6 s errors decay at 2.5 1/s, without prediction at 0.96 1/s at best:
+    With a mismatch of 20 % to either side of 0.6 s, errors decay at 2.5 1/s, without prediction at 0.96 1/s at best:
 
     >>> from gains.core.requirement import Criteria, Requirement
     >>> criteria = Criteria(0.6, "decay_rate_at_delay_1_s", delays_s=(0.48, 0.72), delay_rate=0.0)

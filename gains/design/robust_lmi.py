@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from gains.core._semidefinite import negative, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, SolverError
+from gains.core.semidefinite import negative, solved
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Plant
 from gains.performance.robust import disturbance_bound

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import Requirement
+from gains.core.semidefinite import SolverFacts
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.performance.robust import disturbance_bound

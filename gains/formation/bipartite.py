@@ -39,18 +39,9 @@ class Subgraph:
 
 @dataclass(frozen=True)
 class Partition:
-    """Subgraphs, sorted by their first link, that together hold every link of a pattern exactly once.
-
-    `lower_bound` is a lower bound on the number of subgraphs in any partition.
-    """
+    """Subgraphs, sorted by their first link, that together hold every link of a pattern exactly once."""
 
     subgraphs: tuple[Subgraph, ...]
-    lower_bound: int
-
-    @property
-    def smallest(self) -> bool:
-        """Whether this is known to be the smallest partition."""
-        return len(self.subgraphs) == self.lower_bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +68,7 @@ class ExpandedGain:
 
 
 def partition_by_input(pattern: Pattern) -> Partition:
-    """The partition with one subgraph for each input and the outputs it uses: φ1 = I if every input uses some.
+    """The partition with one subgraph for each input and the outputs it uses: φ1 = I if every input uses an output.
 
     The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
 
@@ -86,11 +77,11 @@ def partition_by_input(pattern: Pattern) -> Partition:
     >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
     [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
-    return Partition(tuple(_rows(pattern.blocks)), _rank_bound(pattern.blocks))
+    return Partition(tuple(_rows(pattern.blocks)))
 
 
 def smallest_partition(pattern: Pattern) -> Partition:
-    """The partition with the fewest subgraphs, or the best one found: see `Partition.smallest`.
+    """The partition with the fewest subgraphs, or the best one found if a search through all would take too long.
 
     The best of three heuristics (by input, by output, largest first) is the smallest if its size equals the rank of the
     pattern, a lower bound on all partitions (Graham and Pollak). Otherwise all smaller partitions are tried, up to
@@ -98,7 +89,7 @@ def smallest_partition(pattern: Pattern) -> Partition:
     """
     row_class, column_class = _classes(pattern.blocks), _classes(pattern.blocks.T)
     core = pattern.blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
-    bound = _rank_bound(core)
+    bound = int(np.linalg.matrix_rank(core.astype(float)))
     by_output = [Subgraph(graph.outputs, graph.inputs) for graph in _rows(core.T)]
     best = min(_rows(core), by_output, _largest_first(core), key=len)
     if len(best) > bound and int(core.sum()) <= LARGEST_SEARCH_LINKS:
@@ -116,7 +107,7 @@ def smallest_partition(pattern: Pattern) -> Partition:
         )
         for graph in best
     ]
-    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)), bound)
+    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)))
 
 
 def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
@@ -179,10 +170,6 @@ def _stacked(vehicles: list[int], sizes: tuple[int, ...]) -> FloatArray:
     starts = np.concatenate([[0], np.cumsum(sizes)])
     index = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in vehicles] or [np.zeros(0, dtype=np.intp)])
     return np.eye(int(starts[-1]))[index.astype(np.intp)]
-
-
-def _rank_bound(blocks: BoolArray) -> int:
-    return int(np.linalg.matrix_rank(blocks.astype(float)))
 
 
 def _classes(rows: BoolArray) -> list[list[int]]:

@@ -62,7 +62,9 @@ def feedback_of_matrices(
 
 
 def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]:
-    """`delayed_feedback` of num / den, highest power first, also nested as [[num]]; raises likewise.
+    """`delayed_feedback` of the transfer function num / den, highest powers first; either may be nested, as in [[num]].
+
+    Raises BadModelError as `delayed_feedback` does.
 
     >>> sum(feedback_of_polynomials([2], [1, 3])).tolist()
     [[-5.0]]

@@ -22,14 +22,13 @@ from math import ceil, exp
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, matrix_exponentials
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 from gains.sampled._loop import (
     HeldPlant,
     held_entry,
     lifted_map,
-    matrix_exponentials,
     radius_of,
     rate_of,
     settled_covariance,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gains.core._bracketing import highest
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
+from gains.formation.model import FormationModel
 
 Gains = tuple[FloatArray, FloatArray, FloatArray]
 """K1, K2 and K3, each of shape (axes, axes)."""
@@ -67,6 +68,32 @@ def string_peak(
 
     near = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
     return max(1.0, largest_magnitude(growth, near_rad_s=near or 1.0))
+
+
+def formation_string_peak(formation: FormationModel, K: FloatArray) -> float | None:
+    """Return the largest |E_i / E_j| over frequencies, for a follower i of a follower j, if the leader is disturbed.
+
+    E are spacing errors without delay, on the first axis. K (inputs, states) may have any pattern; with that of a
+    leader-follower tree the result is `string_peak` where that exceeds 1. None if no follower follows another.
+
+    >>> chain = FormationModel((-1, 0, 1), axes=1)
+    >>> K = chain.overlapping_gain([[-1.0]], [[0.0]], [[1.0]])
+    >>> round(formation_string_peak(chain, K), 4)
+    1.1547
+    """
+    single, narrow = formation.narrowed(K)
+    pairs = [(i, single.predecessors[i]) for i in single.followers if single.predecessors[i] > 0]
+    if not pairs:
+        return None
+    closed_loop = single.A + single.B @ narrow
+    behind, ahead = ([single.spacing_slice(pair[k]).start for pair in pairs] for k in (0, 1))
+
+    def growth(omega: FloatArray) -> FloatArray:
+        shifted = 1j * omega[:, None, None] * np.eye(single.states) - closed_loop
+        error = np.abs(np.linalg.solve(shifted, single.B[:, :1])[..., 0])
+        return (error[:, behind] / error[:, ahead]).max(axis=1)
+
+    return largest_magnitude(growth, near_rad_s=float(np.abs(np.linalg.eigvals(closed_loop)).max()))
 
 
 def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_rad_s: float) -> float:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import BoolArray, ComplexArray, FloatArray
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray, matrix_exponentials
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import factor_rank
 
@@ -93,34 +93,6 @@ class HeldPlant(ByContent):
         maps = np.zeros((duration_s.size, *self.A.shape))
         maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(self.A[np.ix_(seen, seen)], duration_s)
         return maps
-
-
-def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_one: bool = False) -> FloatArray:
-    """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
-
-    `less_one` gives e^{X t} - I, with all its digits however short t is. All durations share the powers of X: SciPy's
-    `expm` takes 60 us for each matrix of a stack. The last ones are kept: a search asks for those of one plant only.
-    """
-    return _exponentials(len(generator), generator.tobytes(), durations.tobytes(), less_one)
-
-
-@lru_cache(maxsize=16)
-def _exponentials(size: int, content: bytes, at_s: bytes, less_one: bool) -> FloatArray:
-    generator, durations = np.frombuffer(content).reshape(size, size), np.frombuffer(at_s)
-    longest = float(durations.max(initial=0.0))
-    norm = float(np.abs(generator).sum(axis=-1).max(initial=0.0)) * longest
-    squarings = max(0, int(np.ceil(np.log2(norm / 0.5)))) if norm > 0.0 else 0
-    scaled, terms = generator * (longest / 2.0**squarings), [np.eye(len(generator))]
-    # the first omitted term is 0.5^15 / 15! < 2e-17
-    for degree in range(1, 15):
-        terms.append(scaled @ terms[-1] / degree)
-    shares = durations / longest if longest > 0.0 else durations
-    first = 1 if less_one else 0
-    result = np.tensordot(np.vander(shares, 15, increasing=True)[:, first:], np.array(terms[first:]), 1)
-    for _ in range(squarings):
-        result = result @ result + 2.0 * result if less_one else result @ result
-    result.flags.writeable = False
-    return result
 
 
 def held_blocks(

@@ -25,6 +25,11 @@ def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, del
 
     s is q for a delay of exactly q periods, else q + 1. A (n, n), B (n, p) and K (p, n) are real, with the feedback
     u = +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an invalid argument.
+
+    For x' = u, u = -x at tau = T / 2, x_{k+1} = x_k + (u_{k-1} + u_k) T / 2:
+
+    >>> period_map([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.25).tolist()
+    [[0.75, 0.25], [-1.0, 0.0]]
     """
     plant = HeldPlant(*checked_loop(A, B, K), positive_seconds("period_s", period_s))
     return lifted_map(plant, seconds("delay_s", delay_s))

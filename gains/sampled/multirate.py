@@ -136,6 +136,11 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; BadModelError names one that does not fit. A
     `delay_s` (s) below the least mean possible at these rates is raised to it.
+
+    x' = u, u = -x with telemetry at 1 Hz, control at 5 Hz and a loop delay of half a second decays at ln(2) / 2:
+
+    >>> round(multirate_growth_rate([[0]], [[1]], [[-1]], Timing(control_s=0.2, telemetry_s=1.0), delay_s=0.5), 6)
+    -0.346574
     """
     common_s = of_type("timing", timing, Timing).common_s
     return lifted_growth(held_blocks(*checked_loop(A, B, K), period_s=common_s), timing, delay_s=delay_s)

@@ -25,14 +25,14 @@ from math import ceil
 
 import numpy as np
 
-from gains.core.arrays import FloatArray, IntArray
+from gains.core.arrays import FloatArray, IntArray, matrix_exponentials
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, positive_seconds
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled._crossings import block_delay_margin
-from gains.sampled._loop import ByContent, matrix_exponentials
+from gains.sampled._loop import ByContent
 from gains.sampled.multirate import Timing, is_nearly_continuous, lifted_growth, lifted_margin
 
 # instants this close to a step (in steps) coincide with it

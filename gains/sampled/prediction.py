@@ -76,7 +76,7 @@ def mismatch_window_continuous(
 ) -> tuple[float, float]:
     """The mismatch window of the continuous loop. A hold counts as half a period in both delays.
 
-    The frequencies come from a sweep of loci: a search, not a proof. Arguments as for `mismatch_window`, BadModelError
+    The frequencies come from a sweep of loci: a search, not a proof. Arguments as for `mismatch_window`; BadModelError
     names one that does not fit.
 
     For x' = u, u = -x the characteristic equation is s + 1 + e^{-s tau} - e^{-3 s} = 0:

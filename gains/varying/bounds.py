@@ -17,9 +17,9 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.core.structure import balanced, distinct_blocks, is_number, shown, square_matrices
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin

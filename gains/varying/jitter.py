@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import highest
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
 from gains.core.errors import BadModelError
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.core.structure import balanced, distinct_blocks, seconds, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay

@@ -43,10 +43,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import highest
-from gains.core.arrays import BoolArray, ComplexArray, FloatArray, spectral_norms
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray, matrix_exponentials, spectral_norms
 from gains.core.errors import BadModelError
 from gains.core.structure import seconds
-from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
+from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry
 from gains.sampled.constant import checked_loop
 from gains.sampled.multirate import Predictor, Timing, lifted_radius
 from gains.sampled.prediction import checked_mask

@@ -57,9 +57,10 @@ def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, 
 def chosen_now(
     scenario: "Scenario", link: "StationSocket | None", there: "Presence | None", key_file: Path | None, *, shown: bool
 ) -> "tuple[Scenario, LinkPart]":
-    """The scenario with gains for its links, measured now (without `link`, in virtual time), and why these gains.
+    """Measure the links of a scenario now, and return it with gains for them and the reason for these gains.
 
-    `there` finds running simulated vehicles; if there are none, they are started. None if others are to be flown.
+    The links are measured through `link`, or in virtual time if it is None. `there` takes over simulated
+    vehicles that run already; if there are none, they are started. It is None if other vehicles are to be flown.
     """
     from gcs.watch.before_flight import measured_now
     from gcs.watch.for_link import best_for

@@ -20,8 +20,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from gains.core.arrays import FloatArray
-from gains.sampled._loop import matrix_exponentials
+from gains.core.arrays import FloatArray, matrix_exponentials
 from gains.sampled.onboard import own_part, streamed_loop
 from gcs.control.history import Reports, State
 from gcs.control.law import FeedbackLaw

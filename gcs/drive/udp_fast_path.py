@@ -55,7 +55,7 @@ _STEP = np.dtype(
 
 
 class Wire(NamedTuple):
-    """The sockets of a station, and the buffers that are read into."""
+    """The sockets of a station, and the buffers into which they are read."""
 
     read_from: Ints
     """Descriptors of the sockets."""

@@ -11,17 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from scenarios.kernel import Array, kernel
-from scenarios.sockets import Bytes, Ints, joined, number_of
+from scenarios.sockets import Bytes, Ints, joined
 
 Address = int
-"""A host, a port and a network, which is the number of the station's socket that the address sends to: see
-`address_at`. 0 is none."""
+"""A host and a port (`scenarios.sockets.number_of`) and, in the bits above, the network: the number of the station's
+socket that sends to the address. 0 is none."""
 NETWORK_BIT, NUMBER_BITS = 48, (1 << 48) - 1
 """First bit of the network in an address, and the mask of the bits below it, which hold `number_of` host and port."""
-
-
-def address_at(host: str, port: int, network: int = 0) -> Address:
-    return network << NETWORK_BIT | number_of((host, port))
 
 
 def network_at(address: Address) -> int:

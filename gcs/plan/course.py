@@ -150,7 +150,7 @@ def _spans(scenario: Scenario, formation: Formation) -> Iterator[_Span]:
 
 
 class Nearest(NamedTuple):
-    """The least distance between two vehicles of the planned motion."""
+    """The least distance between any two vehicles in the planned motion, and when and between which it occurs."""
 
     distance_m: float
     time_s: float

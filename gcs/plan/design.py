@@ -10,9 +10,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement, plain
+from gains.core.semidefinite import SolverFacts
 from gains.performance.response import Response
 from gcs.published import Published
 from scenarios.schema import GainBlock

@@ -47,7 +47,7 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
 def gain_blocks(
     K: RealArray, formation: Formation, links: Sequence[tuple[int, int]] | None = None
 ) -> tuple[GainBlock, ...]:
-    """K as the blocks of a scenario: those of `links`, or without them the nonzero ones and each vehicle's own."""
+    """K as the blocks of a scenario: one for each of `links` or, if None, each vehicle's own and all nonzero ones."""
     model, ids = formation.model, formation.system_ids
     return tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))

@@ -128,7 +128,7 @@ def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int
 
 
 def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
-    """Whether vehicles share this loop over different links, where its margin says little and a model says more.
+    """Whether vehicles share this loop over different links: a model of each delay then says more than one margin.
 
     Always false with prediction, without a model, and for more vehicles than are searched.
     """

@@ -180,7 +180,7 @@ def code_records(scenario: Scenario) -> tuple[CodeRecord, ...]:
 
 
 def code_by_key(scenario: Scenario) -> dict[str, CodeRecord]:
-    """The code file of each key that names one, under a text such as "control.controller = my_law.py:law"."""
+    """The code file that each key names, by the key as it stands: "control.controller = my_law.py:law"."""
     known = {code.name: code.sha256 for code in scenario.code}
     named = {f"{key} = {name}": name.rpartition(":")[0] for key, name in code_names(scenario).items()}
     return {text: CodeRecord(file=path, sha256=known[path]) for text, path in named.items()}

@@ -103,9 +103,9 @@ def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
 def response_paired(
     plan: FlightPlan, calm: Flight, system_ids: tuple[int, ...], *, amplitude: float, folder: Path | None
 ) -> FreeResponse:
-    """Fly the second flight of a pair, with an initial error of the given vehicles, and subtract the first, `calm`.
+    """Fly the second flight of a pair, where the given vehicles start with an error, and subtract the first, `calm`.
 
-    `amplitude` is that of `in_place`. Rows are dropped from where the two flights no longer use the same states.
+    `amplitude` is that of `in_place`. The result ends where the two flights begin to use different states.
     """
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_plan(disturbed, folder, with_truth=True)

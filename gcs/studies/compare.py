@@ -13,12 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
 from gains.design.dk_iteration import LARGEST_STATES, abscissa
-from gains.formation.model import FormationModel
 from gains.performance.robust import disturbance_bound
-from gains.performance.string_stability import largest_magnitude
+from gains.performance.string_stability import formation_string_peak
 from gains.sampled.constant import forget_margins
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_plan
@@ -120,7 +118,7 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
         delay_margin_s=summary.delay_margin_s,
         delay_margin_continuous_s=summary.delay_margin_continuous_s,
         decay_rate_1_s=-abscissa(model.A + model.B @ K),
-        string_peak=string_peak(model, K),
+        string_peak=formation_string_peak(model, K),
         links=sum(bool(numbers.any()) for numbers in used),
         numbers_used=sum(int(numbers.sum()) for numbers in used),
     )
@@ -137,27 +135,6 @@ def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
         if first > 0.1:  # smaller initial errors are noise
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
-
-
-def string_peak(model: FormationModel, K: FloatArray) -> float | None:
-    """Largest |E_i / E_j| over frequencies, for a follower i of a follower j, with the leader's command disturbed.
-
-    None if no follower follows another. Uses the search of `gains.performance.string_stability`.
-    """
-    single = FormationModel(model.predecessors, axes=1)
-    narrow = K[:: model.axes, :: model.axes]
-    closed_loop = single.A + single.B @ narrow
-    pairs = [(i, single.predecessors[i]) for i in single.followers if single.predecessors[i] > 0]
-    if not pairs:
-        return None
-    behind, ahead = ([single.spacing_slice(pair[k]).start for pair in pairs] for k in (0, 1))
-
-    def growth(omega: FloatArray) -> FloatArray:
-        shifted = 1j * omega[:, None, None] * np.eye(single.states) - closed_loop
-        error = np.abs(np.linalg.solve(shifted, single.B[:, :1])[..., 0])
-        return (error[:, behind] / error[:, ahead]).max(axis=1)
-
-    return largest_magnitude(growth, near_rad_s=float(np.abs(np.linalg.eigvals(closed_loop)).max()))
 
 
 def write_comparison(

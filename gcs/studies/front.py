@@ -121,7 +121,7 @@ def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
 def point_at(
     scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
 ) -> tuple[Scenario, GainsAtDelay]:
-    """The scenario with the gains of a point of the front; prediction None takes the better of with and without.
+    """The scenario with the gains of a point of the front, predicted or not: with `prediction` None, the better.
 
     Raises InputError if no gains take the delay.
     """

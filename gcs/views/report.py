@@ -232,7 +232,7 @@ def print_summary(summary: Summary, folder: Path) -> None:
 
 
 def flight_lines(summary: Summary) -> dict[str, str]:
-    """The lines about a flight as a whole, by heading; `verdict` holds the reason without the verdict itself."""
+    """The lines about a flight as a whole, by heading; the line `verdict` gives only its reason."""
     flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
     lines = {"verdict": f"{_reason(summary)}{flown}", "delay": delay_text(summary)}
     if summary.verdict == "unstable" and (summary.headroom_end or 0.0) >= 0.0:

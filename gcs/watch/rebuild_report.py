@@ -42,7 +42,10 @@ class LogSource:
 
 
 def found(run_or_file: Path) -> LogSource:
-    """A log, with the files beside it if it is a run's only log. Raises InputError for a run beyond network 0."""
+    """A log, with the files beside it if it is a run's only log.
+
+    Raises InputError for the folder of a run in several networks, which has a log for each.
+    """
     log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
     others = sorted(log_file.parent.glob(tlog_file("*")))
     if run_or_file.is_dir() and others:

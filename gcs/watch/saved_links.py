@@ -140,7 +140,7 @@ def describe(profile: LinkProfile) -> list[str]:
 
 
 def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
-    """A link that replays these delays in order."""
+    """A link whose datagrams have these delays, in order."""
     trace = tuple(round(delay_s, 6) for delay_s in delays_s[:TRACE_DELAYS].tolist())
     return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss)
 

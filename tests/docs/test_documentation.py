@@ -74,6 +74,13 @@ def test_the_readme_is_short() -> None:
     assert len(PAGES["README.md"].read_text(encoding="utf-8").splitlines()) <= 120
 
 
+def test_a_test_has_a_name_of_at_most_ten_words() -> None:
+    names = [
+        name for file in (ROOT / "tests").rglob("*.py") for name in re.findall(r"def test_(\w+)", file.read_text())
+    ]
+    assert [name for name in names if name.count("_") >= 10] == []
+
+
 def test_every_scenario_key_has_a_description() -> None:
     whole = schema()
     parts = {"Scenario": whole, **whole["$defs"]}

@@ -23,7 +23,7 @@ def test_errors_stop_dying_away_past_the_margin(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(180)
-def test_a_law_of_ones_own_flies_with_and_without_a_margin(tmp_path: Path) -> None:
+def test_an_own_law_flies_with_and_without_a_margin(tmp_path: Path) -> None:
     command = [sys.executable, EXAMPLES / "own_law" / "fly.py"]
     said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.splitlines()
     assert said == [

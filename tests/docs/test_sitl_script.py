@@ -49,5 +49,5 @@ def test_five_vehicles_start_at_the_places_of_copters5(tmp_path: Path) -> None:
         assert altitude_m == origin[2]
 
 
-def test_the_script_exits_with_the_gates_code_and_ends_the_vehicles(tmp_path: Path) -> None:
+def test_the_script_exits_with_the_gates_code_and_ends_vehicles(tmp_path: Path) -> None:
     assert started(tmp_path, 3).returncode == 3  # and returned at once, though the vehicles would sleep for a minute

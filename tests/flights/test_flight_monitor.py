@@ -198,7 +198,7 @@ def test_a_collision_breaks_the_flight_and_least_distance_is_summarised() -> Non
     assert 0.0 < known(summary.distance_min_m) < 180.0
 
 
-def test_the_alpha_of_a_flight_is_that_of_the_gains_flown_longest() -> None:
+def test_alpha_of_a_flight_is_that_of_gains_flown_longest() -> None:
     late = load(SCENARIOS / "chain3.toml").with_link_delay(up_s=0.17, down_s=0.17)
     designed, plan = flight_plan(late.model_copy(update={"duration_s": 20.0}))
     flight = fly_plan(plan)

@@ -11,7 +11,7 @@ from gcs.cli.main import main
 from gcs.drive.flown import fly_plan
 from gcs.drive.lockstep import START_NS, fly_lockstep, signed_ends
 from gcs.errors import InputError
-from gcs.link.datagram import Datagram, address_at
+from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.record import tlog_file
@@ -25,6 +25,7 @@ from scenarios.schema import Scenario
 from scenarios.signing.keys import KEY_BYTES, Key
 from tests.support.fleets.logged_flight import log_bytes
 from tests.support.paths import SCENARIOS
+from tests.support.station_peer import address_at
 
 IDS = {1: 1, 2: 2, 3: 1001, 4: 1002, 5: 9002}
 """Vehicles 1 and 2 of networks 0 and 1, and a vehicle 2 of network 9."""
@@ -54,7 +55,7 @@ def senders(folder: Path, network: int) -> set[int]:
     "real_time",
     [False, pytest.param(True, marks=[pytest.mark.realtime, pytest.mark.xdist_group("realtime")])],
 )
-def test_vehicles_of_the_same_id_fly_in_networks_of_their_own(real_time: bool, tmp_path: Path) -> None:
+def test_vehicles_of_the_same_id_fly_in_their_own_networks(real_time: bool, tmp_path: Path) -> None:
     flight = fly_plan(planned(renumbered(2.0)), tmp_path / "run", real_time=real_time)
     assert flight.events[-1].text == "completed: duration reached"
     flown = flight.ticks[flight.ticks["time_s"] > 1.0]

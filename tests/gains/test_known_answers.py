@@ -35,7 +35,7 @@ def test_a_simple_crossing_is_known_to_rounding() -> None:
 
 
 @pytest.mark.parametrize("multiple", [1, 2])
-def test_a_crossing_off_by_a_little_is_off_by_its_square_after_a_step(multiple: int) -> None:
+def test_one_step_squares_the_error_of_a_crossing(multiple: int) -> None:
     """s = a + b e^{-s k tau} crosses at omega^2 = b^2 - a^2, cos(k theta) = -a / b."""
     a, b = -1.0, -2.0
     terms = [np.array([[a]]), *(np.zeros((1, 1)) for _ in range(multiple - 1)), np.array([[b]])]
@@ -60,7 +60,7 @@ def test_loci_are_evaluated_once_at_a_frequency() -> None:
 
 
 @pytest.mark.parametrize("together", [1, 2])
-def test_vectors_of_a_nearly_singular_matrix_are_those_of_its_decomposition(together: int) -> None:
+def test_vectors_of_nearly_singular_matrices_are_those_of_their_decomposition(together: int) -> None:
     rng = np.random.default_rng(1)
     parts = rng.normal(size=(2, 30, 30)) + 1j * rng.normal(size=(2, 30, 30))
     U, Vh = (np.linalg.qr(part)[0] for part in parts)

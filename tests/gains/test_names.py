@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -10,6 +11,7 @@ from pkgutil import iter_modules
 import pytest
 
 import gains
+from tests.support.paths import ROOT
 
 
 def rooms() -> set[str]:
@@ -43,6 +45,12 @@ def test_every_room_is_described() -> None:
     assert gains.__doc__
     described = {line.split("`")[1] for line in gains.__doc__.splitlines() if line.startswith("* `")}
     assert described == rooms()
+
+
+@pytest.mark.parametrize("package", ["gcs", "docs", "examples"])
+def test_internal_modules_are_imported_by_gains_alone(package: str) -> None:
+    text = "\n".join(file.read_text() for file in (ROOT / package).rglob("*.py"))
+    assert re.findall(r"^ *from gains[\w.]*\._.*", text, re.MULTILINE) == []
 
 
 def test_the_function_design_is_not_hidden_by_its_room() -> None:

@@ -5,7 +5,8 @@ import socket
 import pytest
 
 from gcs.drive.udp import StationSocket, clock_ns
-from gcs.link.datagram import Datagram, address_at
+from gcs.link.datagram import Datagram
+from tests.support.station_peer import address_at
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 

@@ -35,7 +35,7 @@ def lost_arrays(caller: Any) -> Iterator[str]:
             yield f"{caller._name} calls {called._name}"
 
 
-def test_no_arrays_are_returned_to_a_kernel_that_counts_no_references() -> None:
+def test_no_arrays_are_returned_to_kernels_that_count_no_references() -> None:
     for package in ("gcs", "scenarios", "sim_vehicles"):
         for module in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
             import_module(module.name)
@@ -99,7 +99,7 @@ def test_what_one_copy_of_the_source_compiled_no_other_compiles(
     assert announced == ["first", "changed"]
 
 
-def test_threads_that_call_kernels_for_the_first_time_find_one_cache(
+def test_threads_calling_kernels_for_the_first_time_find_one_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As in a worker of a cluster with several threads."""

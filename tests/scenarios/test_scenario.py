@@ -295,7 +295,7 @@ def test_every_copter_must_have_an_altitude_to_take_off_to() -> None:
     ("line", "read", "wanted"),
     [("", "no such key", "an altitude above 0 to take off to"), ("altitude_m = 400.0", "400.0", "at most 300, which")],
 )
-def test_copters_take_off_to_an_altitude_that_they_are_given_and_reach(line: str, read: str, wanted: str) -> None:
+def test_copters_take_off_to_a_given_altitude_that_they_reach(line: str, read: str, wanted: str) -> None:
     text = (SCENARIOS / "copters5.toml").read_text()
     with pytest.raises(ScenarioError, match=f"altitude_m: read {read}, wanted {wanted}"):
         parse(text.replace("altitude_m = 20.0", line, 1), FILE)

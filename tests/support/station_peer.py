@@ -5,7 +5,13 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.link.datagram import Address, Datagram, Outgoing, address_at
+from gcs.link.datagram import NETWORK_BIT, Address, Datagram, Outgoing
+from scenarios.sockets import number_of
+
+
+def address_at(host: str, port: int, network: int = 0) -> Address:
+    return network << NETWORK_BIT | number_of((host, port))
+
 
 HOME = address_at("127.0.0.1", 5001)
 

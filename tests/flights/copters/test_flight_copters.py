@@ -149,7 +149,7 @@ def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
 
 
 @pytest.mark.slow(first=0)
-def test_the_margin_is_that_of_the_velocity_flown_where_the_air_resists() -> None:
+def test_margin_in_resisting_air_is_that_of_the_velocity_flown() -> None:
     resisted, still = three(drag_1_m=0.06), (NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0)),)
     short = resisted.model_copy(update={"duration_s": 1.0})
     margin_s, at_rest_s = (
@@ -372,7 +372,7 @@ def test_a_gimbal_with_the_same_system_id_is_no_vehicle() -> None:
     assert messages(outgoing, "COMMAND_LONG") == []  # one command is in flight already
 
 
-def test_a_vehicle_that_reports_no_motion_is_not_blamed_for_its_telemetry() -> None:
+def test_vehicle_reporting_no_motion_is_not_blamed_for_its_telemetry() -> None:
     """Vehicle 3 always reports the velocity 0."""
 
     def at_rest(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:

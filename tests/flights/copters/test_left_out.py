@@ -54,7 +54,7 @@ def test_others_fly_without_a_vehicle_that_is_never_heard(flavour: str) -> None:
     assert not rows["commanded"].any()
 
 
-def test_the_follower_of_a_left_out_vehicle_keeps_the_sum_of_offsets() -> None:
+def test_follower_of_a_left_out_vehicle_keeps_both_offsets() -> None:
     flight = fly(plan_for(lacking(2)))
     assert flight.station.end_reason == "left out: vehicles 2"
     last = {k: flight.flown[flight.flown["system_id"] == k][-1] for k in (1, 3)}
@@ -100,7 +100,7 @@ def test_nobody_ready_is_no_flight() -> None:
     assert not flight.ticks["commanded"].any()
 
 
-def test_a_fleet_left_out_by_the_user_is_flown_as_its_own_formation() -> None:
+def test_formation_without_left_out_vehicles_is_flown_as_its_own() -> None:
     scenario = without(three(), [2], Path("copters5.toml"))
     design, plan = flight_plan(scenario)
     flight = fly(plan)
@@ -130,7 +130,7 @@ def test_copters_stop_in_flight_and_fly_on() -> None:
         assert rows["velocity_north_m_s"].tolist() == pytest.approx([speed] * len(rows), abs=0.1)
 
 
-def test_patience_does_not_count_what_waited_in_the_socket_before_the_start() -> None:
+def test_patience_ignores_datagrams_that_arrived_before_the_start() -> None:
     station = Station(plan_for(lacking(3, patience_s=8.0)), start_ns=START_NS)
     peers = [Peer(k, 5000 + k) for k in (1, 2, 3)]
     waited = [peer.heartbeat(START_NS - before_ns) for before_ns in (30_000_000_000, 1_000_000) for peer in peers]

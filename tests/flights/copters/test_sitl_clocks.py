@@ -40,7 +40,7 @@ def flown(duration_s: float, **changes: Any) -> Flight:
     return fly(replace(planned()[1], scenario=scenario))
 
 
-def test_ten_minutes_of_lying_clocks_show_no_jump_and_no_negative_delay() -> None:
+def test_lying_clocks_show_no_jump_or_negative_delay() -> None:
     flight = flown(600.0)
     assert flight.station.end_reason == "completed: duration reached"
     assert CLOCK_JUMPED not in flight.texts("vehicle")

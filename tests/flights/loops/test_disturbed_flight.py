@@ -39,7 +39,7 @@ def test_flown_spread_of_the_errors_is_the_computed_one(delay_s: float, predicti
 
 
 @pytest.mark.parametrize("prediction", ["off", "measured"])
-def test_the_spread_of_vehicles_that_sample_at_other_instants_is_computed_too(prediction: str) -> None:
+def test_spread_is_computed_for_vehicles_that_sample_at_other_instants(prediction: str) -> None:
     apart = chain(navigation=NOISE, clocks=Clocks(drift_max_ppm=0.0), duration_s=40.0, seed=3)
     apart = apart.model_copy(update={"control": apart.control.model_copy(update={"prediction": prediction})})
     flown = fly_virtual(apart.with_link_delay(up_s=0.04, down_s=0.06))

@@ -51,7 +51,7 @@ def chosen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, LinkPart
 
 
 @pytest.mark.parametrize("predict", ["off", "on"])
-def test_a_point_of_the_front_decays_in_flight_as_it_says(predict: str) -> None:
+def test_a_point_of_the_front_decays_in_flight_as_computed(predict: str) -> None:
     delay_s = 0.4
     way = "on" if predict == "on" else "off"
     scenario, point = point_at(CHAIN, delay_s, "inclusion", "alpha_at_delay", way)  # fastest is a multiple root
@@ -71,7 +71,7 @@ def test_a_point_of_the_front_decays_in_flight_as_it_says(predict: str) -> None:
     assert -known(outcome.growth_1_s) == pytest.approx(known(point.decay_rate_1_s), rel=0.03)
 
 
-def test_the_delay_of_a_log_is_that_which_the_station_measured(chosen: tuple[Scenario, LinkPart]) -> None:
+def test_the_delay_of_a_log_is_what_the_station_measured(chosen: tuple[Scenario, LinkPart]) -> None:
     """Within half a period: where telemetry falls between two ticks is drawn, and in a flight it stays."""
     part = chosen[1]
     assert part.loop_delay_s_p50 == pytest.approx(logged()[1], abs=PERIOD_S / 2.0)
@@ -111,7 +111,7 @@ def test_a_flight_keeps_the_headroom_that_was_asked_for() -> None:
 
 
 @pytest.mark.slow(first=0)
-def test_gains_for_a_short_delay_are_designed_though_a_long_one_leaves_them_nothing() -> None:
+def test_short_delays_get_gains_though_long_ones_allow_none() -> None:
     """Over the 20 ms of chain3 they are so fast that a prediction over 3 s would tolerate 1 ms."""
     flight = fly_virtual(CHAIN.model_copy(update={"control": Control(for_link="measured"), "duration_s": 2.0}))
     assert flight.summary.verdict == "stable"
@@ -137,7 +137,7 @@ def test_a_scenario_for_measured_links_is_not_designed_without_them() -> None:
         checked(CHAIN.model_copy(update={"control": control}), Path("chain3.toml"))
 
 
-def test_gains_for_a_link_are_refused_to_vehicles_of_unknown_response() -> None:
+def test_gains_for_links_are_refused_for_vehicles_of_unknown_response() -> None:
     late = coded(dynamics="lagged").model_copy(update={"control": Control()})
     with pytest.raises(
         InputError, match=r"read dynamics own.py:lagged, wanted a \[response\], which gcs identify finds"
@@ -157,7 +157,7 @@ def test_gains_for_a_link_are_refused_to_vehicles_of_unknown_response() -> None:
         checked(for_link.model_copy(update=known | {"control": damped}), Path("own.toml"))
 
 
-def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> None:
+def test_links_measured_before_a_flight_have_its_logs_delays() -> None:
     jitter = Jitter(distribution="uniform", scale_s=0.03)
     links = Links(up=Link(delay_s=0.2, jitter=jitter, loss_probability=0.05), down=Link(delay_s=0.1))
     scenario = CHAIN.model_copy(update={"control": Control(for_link="measured"), "links": links})

@@ -62,7 +62,7 @@ QUICK_AND_SLOW = {
 """Vehicle 2 is quick and takes 290 ms; vehicle 3 is slow and takes more than a second."""
 
 
-def test_a_quick_vehicle_keeps_its_own_margin_beside_a_slow_link() -> None:
+def test_a_quick_vehicle_keeps_its_margin_beside_a_slow_link() -> None:
     """Flown, vehicle 2 alone breaks the loop at 289.65 ms of loop delay."""
     scenario = over(chain(QUICK_AND_SLOW), 0.03, v3=0.25)
     plan = over_own_links(*flight_plan(scenario))[1]
@@ -75,7 +75,7 @@ def test_a_quick_vehicle_keeps_its_own_margin_beside_a_slow_link() -> None:
     assert known(flown.vehicles[1].headroom_min_s) == pytest.approx(0.2895 - 0.074, abs=0.01)
 
 
-def test_the_monitor_slows_the_gains_before_a_quick_vehicle_breaks_them() -> None:
+def test_the_monitor_slows_gains_before_a_quick_vehicle_breaks_them() -> None:
     """The links turn out slower than planned: in flight vehicle 2 has 350 ms."""
     plan = over_own_links(*flight_plan(over(chain(QUICK_AND_SLOW), 0.03, v3=0.25)))[1]
     late = over(plan.scenario, 0.03, v2=0.17, v3=0.25)

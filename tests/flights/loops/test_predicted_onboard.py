@@ -41,7 +41,7 @@ def planned(prediction: float | str) -> FlightPlan:
     return flight_plan(triangle(prediction).with_calm_monitor())[1]
 
 
-def test_the_window_is_that_of_the_own_loops_step_by_step() -> None:
+def test_the_window_is_that_of_own_loops_step_by_step() -> None:
     """The map of one period, in which vehicles sense, compute and hold at their own steps: nothing is approximated."""
     plan = planned(1.0)
     timing = onboard_timing(plan.scenario)

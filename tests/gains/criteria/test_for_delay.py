@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.requirement import Criteria, Requirement
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.core.structure import roots_of
 from gains.criteria.figures import LoopFigures, pole_region
 from gains.design.design import design
@@ -181,7 +181,7 @@ def test_vehicles_without_lag_take_the_closed_form() -> None:
     assert longest_static_delay(2.0 / PERIOD_S, PERIOD_S)[0] < 0.0
 
 
-def test_gains_for_a_slow_rate_are_best_when_designed_in_discrete_time() -> None:
+def test_gains_for_slow_rates_are_best_designed_in_discrete_time() -> None:
     period_s, delay_s = 0.2, 0.3
     fastest = Criteria(at_delay_s=delay_s, maximise="decay_rate_at_delay_1_s")
     decays: list[float] = []
@@ -203,14 +203,14 @@ def test_gains_for_a_slow_rate_are_best_when_designed_in_discrete_time() -> None
     assert decays[1] > 1.2 * decays[0]
 
 
-def test_alpha_in_discrete_time_tends_to_that_with_half_a_hold() -> None:
+def test_alpha_in_discrete_time_tends_to_that_with_half_hold() -> None:
     gain = PAIR.overlapping_gain([[-2.6]], [[0.4]], [[2.4]])
     for weight in (None, (1.0, 0.7)):
         figures = LoopFigures(PAIR, gain, FlownTiming(np.inf, 0.02), 0.3, weight)
         assert replace(figures, discrete=True).alpha_at_delay == pytest.approx(figures.alpha_at_delay, rel=2e-3)
 
 
-def test_best_alpha_at_a_delay_exceeds_that_of_twice_the_margin() -> None:
+def test_best_alpha_at_a_delay_exceeds_that_of_twice_margin() -> None:
     today = design(CHAIN, Requirement(delay_margin_s=0.6, string_peak_max=1.0), period_s=PERIOD_S)
     own = [gain[:1, :1] for gain in (today.K1, today.K2, today.K3)]
     timing = FlownTiming(np.inf, PERIOD_S)

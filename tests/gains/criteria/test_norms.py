@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.criteria.figures import LoopFigures
 from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.rightmost import rightmost_root
@@ -75,7 +75,7 @@ def test_spacing_gain_is_where_feedback_of_it_destabilises() -> None:
     assert abscissa(1.001 / gain) > 0.0 > abscissa(0.999 / gain)
 
 
-def test_spacing_gain_without_delay_is_that_of_the_bounded_real_lemma() -> None:
+def test_spacing_gain_without_delay_is_that_of_bounded_real_lemma() -> None:
     figures = LoopFigures(PAIR, K, FlownTiming(np.inf, 0.02))
     C, A, B = np.array([[0.0, 1.0, 0.0]]), PAIR.A + PAIR.B @ K, PAIR.B
 

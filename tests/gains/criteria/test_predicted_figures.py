@@ -50,7 +50,7 @@ def test_noise_passes_a_prediction_as_a_simulated_loop_says() -> None:
     assert figures.noise_gain_max == pytest.approx(power.max() ** 0.5, rel=1e-6)
 
 
-def test_noise_near_the_edge_of_the_window_is_that_of_a_simulated_loop() -> None:
+def test_noise_near_the_edge_of_the_window_agrees_with_simulation() -> None:
     """As above, of all states at once: assumed 0.6 s, true 0.76 s. Motions decay in 7800 ticks."""
     assumed, late = 30, 38
     Phi, G = np.eye(3) + PERIOD_S * PAIR.A, PERIOD_S * PAIR.B + PERIOD_S**2 / 2.0 * PAIR.A @ PAIR.B
@@ -166,7 +166,7 @@ def test_the_window_of_a_search_is_near_the_exact_one(assumed_s: float, predeces
 
 
 @pytest.mark.parametrize("share", [0.16, 0.22, 0.31])
-def test_the_window_of_a_search_knows_what_of_a_response_is_measured(share: float) -> None:
+def test_the_window_of_a_search_knows_which_states_are_measured(share: float) -> None:
     """Taking all of its states as measured puts the window's end 2 to 4 % too far out."""
     gain = PAIR.overlapping_gain([[-3.4 * share]], [[0.6 * share]], [[5.6 * share**2]])
     lagged = Response(lag_s=0.15, velocity_gain_1_s=2.0)

@@ -248,7 +248,7 @@ def test_roots_of_many_multiples_are_counted(
         assert found.unstable_roots_at_zero_delay + entered == unstable_roots([(now, 0.0), *delayed])
 
 
-def test_pair_on_the_axis_at_no_delay_beside_a_fixed_root_at_zero() -> None:
+def test_pair_on_axis_without_delay_beside_a_root_at_zero() -> None:
     # det M(s) = s (s^2 + c e^{-s tau}): no root is left to be taken for noise of the one at zero
     now = np.array([[0.0, 0.0, -0.10632528972641878], [0.0, 0.0, 0.0], [0.0, 0.6401019196602797, 0.0]])
     late = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.7418610417423701], [-0.318665534371544, 0.0, 0.0]])

@@ -151,7 +151,7 @@ def test_listing_may_stop_at_a_horizon() -> None:
 
 # at zero delay a pair on the axis leaves it to the left, then to the right
 @pytest.mark.parametrize("delayed", [-0.4, 0.4])
-def test_a_pair_on_the_axis_without_delay_is_unstable_only_if_it_moves_right(delayed: float) -> None:
+def test_pair_on_axis_is_unstable_only_if_it_moves_right(delayed: float) -> None:
     A0, A1 = second_order(0.0, 1.0, delayed)
     # s^2 + 1 - k e^{-s tau} has its next root on the axis at s^2 = -1 - k, tau = pi / sqrt(1 + k)
     assert delay_margin(A0, A1) == pytest.approx(pi / sqrt(1.4) if delayed < 0.0 else 0.0, rel=1e-13)

@@ -32,7 +32,7 @@ def random_case(seed: int) -> tuple[Plant, Pattern]:
     return plant, Pattern(rng.random((vehicles, vehicles)) < 0.5, inputs.tolist(), outputs.tolist())
 
 
-def test_random_gains_and_ranks_agree_on_every_mode_of_random_plants() -> None:
+def test_random_gains_and_ranks_agree_on_modes_of_random_plants() -> None:
     counts = [agreed(*random_case(seed)) for seed in range(400)]
     # a plant with fixed modes and one without are about equally frequent
     assert 120 < sum(count > 0 for count in counts) < 280
@@ -57,7 +57,7 @@ def test_they_agree_on_components_of_many_inputs() -> None:
     assert agreed(formation_plant(chain), bidirectional(chain)) == 0
 
 
-def test_the_least_value_of_a_submodular_function_is_that_of_all_subsets() -> None:
+def test_least_value_of_a_submodular_function_is_that_over_subsets() -> None:
     for seed in range(50):
         columns = np.random.default_rng(seed).integers(0, 2, (5, 7)).astype(float)
         price = np.random.default_rng(seed).integers(0, 2, 7)

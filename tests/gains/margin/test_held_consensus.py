@@ -44,7 +44,7 @@ def test_held_consensus_is_judged_on_its_disagreement(laplacian: FloatArray, mar
     assert radius_on_disagreement(laplacian, found.delay_margin_s * (1.0 + 1e-4)) > 1.0 + 1e-7
 
 
-def test_period_of_held_consensus_ends_at_two_over_its_fastest_mode() -> None:
+def test_period_of_held_consensus_ends_at_two_over_fastest_mode() -> None:
     # x_{k+1} = (1 - lambda T) x_k leaves the unit circle at lambda T = 2
     found = margin_of(np.zeros((3, 3)), np.eye(3), -PATH, None)
     assert found.stable_intervals_s == ((0.0, pytest.approx(2.0 / 3.0)),)
@@ -77,7 +77,7 @@ def test_equal_followers_have_the_error_and_frequency_of_one(period_s: float | N
     assert many.checked_by == one.checked_by
 
 
-def test_error_of_a_margin_of_too_large_a_map_is_not_known() -> None:
+def test_error_of_a_margin_of_too_large_maps_is_unknown() -> None:
     found = margin_of(np.zeros((1, 1)), np.eye(1), -np.eye(1), 0.004)  # pi / 2 s are 393 periods
     assert np.isnan(found.delay_margin_error_s)
     assert found.crossings == found.checked_by == ()

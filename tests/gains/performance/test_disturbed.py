@@ -90,7 +90,7 @@ def test_lyapunov_equation_and_spectrum_give_the_same_spread(
     assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)
 
 
-def test_vehicles_whose_loop_delays_differ_have_the_same_spread_both_ways() -> None:
+def test_vehicles_with_different_loop_delays_have_one_spread_both_ways() -> None:
     late_s = np.array([0.03, 0.157, 0.0])
     flown = DisturbedFormation(CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, late_s, Gusts(0.5, 2.0), EVERYTHING, older=OLDER)
     spread = flown.spread()
@@ -101,7 +101,7 @@ def test_vehicles_whose_loop_delays_differ_have_the_same_spread_both_ways() -> N
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.157])
-def test_noise_averaged_between_two_reports_gives_the_same_spread_both_ways(delay_s: float) -> None:
+def test_noise_averaged_between_reports_gives_the_same_spread_both_ways(delay_s: float) -> None:
     flown = DisturbedFormation(CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, delay_s, Gusts(0.5, 2.0), EVERYTHING, older=OLDER)
     spread = flown.spread()
     assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)

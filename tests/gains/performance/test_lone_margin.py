@@ -51,7 +51,7 @@ def test_matrices_of_a_response_have_its_transfer_function(response: Response) -
         assert abs(found - response.transfer(np.array([omega]))[0]) < 1e-5
 
 
-def test_a_dead_time_that_alone_breaks_the_loop_leaves_no_margin() -> None:
+def test_dead_time_that_alone_breaks_the_loop_leaves_no_margin() -> None:
     assert lone_margin(3.0, 3.0, Response(0.2, 0.5, 0.2), period_s=0.02) == 0.0
     with pytest.raises(BadModelError, match="natural frequency"):
         Response(0.1, 1.0, 0.05, 14.0)

@@ -105,7 +105,7 @@ def test_one_follower_has_the_robustness_bound_and_the_whole_less() -> None:
     assert sector(0.0, 5).complex_radius().radius_1_s == pytest.approx(0.508, abs=5e-4)
 
 
-def test_sampled_radius_is_that_of_the_continuous_model_but_for_sampling() -> None:
+def test_sampled_radius_is_that_of_the_continuous_model_except_sampling() -> None:
     flown = FlownFormation(PAIR, GAIN[:2, :3], FlownTiming(0.3, T))
     assert sector(0.15, 2).complex_radius().radius_1_s == pytest.approx(flown.alpha(0.15), rel=5e-3)
 

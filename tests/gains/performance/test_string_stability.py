@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from gains.core.errors import BadModelError
-from gains.performance.string_stability import largest_magnitude, string_peak
+from gains.design.design import design
+from gains.formation.model import FormationModel
+from gains.performance.string_stability import formation_string_peak, largest_magnitude, string_peak
+
+CHAIN = FormationModel((-1, 0, 1))
 
 
 def peak_of(own: float, front: float, spacing: float, delay_s: float = 0.0) -> float:
@@ -46,3 +50,14 @@ def test_peak_with_delay_is_that_of_a_dense_grid(gain: float, delay_s: float) ->
 def test_a_sweep_around_no_frequency_is_refused(near_rad_s: float) -> None:
     with pytest.raises(BadModelError, match="near_rad_s is"):
         largest_magnitude(lambda omega: omega, near_rad_s=near_rad_s)
+
+
+def test_formation_string_peak_equals_that_of_two_followers() -> None:
+    found = design(CHAIN, period_s=0.02)
+    K = CHAIN.overlapping_gain(found.K1, found.K2, 1.4 * found.K3)
+    k1, k2, k3 = -found.K1[0, 0], found.K2[0, 0], 1.4 * found.K3[0, 0]
+    s = 1j * np.geomspace(1e-3, 1e2, 20000)
+    peak = np.abs((k2 * s + k3) / (s**2 + k1 * s + k3)).max()
+    assert peak > 1.05
+    assert formation_string_peak(CHAIN, K) == pytest.approx(peak, rel=1e-4)
+    assert formation_string_peak(FormationModel((-1, 0)), np.zeros((4, 6))) is None

@@ -110,7 +110,7 @@ def test_blocks_far_from_their_ends_do_not_change_the_window(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_maps_of_the_difference_have_the_radius_of_the_lifted_map(seed: int) -> None:
+def test_maps_of_the_difference_have_the_lifted_maps_radius(seed: int) -> None:
     rng = np.random.default_rng(seed)
     control_s = float(rng.choice([0.05, 0.2]))
     rates, assumed_s = Timing(control_s, control_s * float(rng.choice([1.0, 1.3, 2.5, 5.0]))), rng.uniform(0.0, 1.5)

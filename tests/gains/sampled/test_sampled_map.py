@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from gains.core.arrays import matrix_exponentials
 from gains.core.errors import BadModelError
-from gains.sampled._loop import matrix_exponentials
 from gains.sampled.constant import growth_rate, period_map, spectral_radius
 
 Matrix = NDArray[np.float64]

@@ -194,7 +194,7 @@ def test_period_limit_of_a_follower_is_the_closed_form() -> None:
 
 
 @pytest.mark.parametrize("angle", np.linspace(0.1, 1.5, 15))
-def test_period_limit_of_a_follower_is_the_same_in_turned_coordinates(angle: float) -> None:
+def test_period_limit_of_a_follower_is_unchanged_in_turned_coordinates(angle: float) -> None:
     # rounding makes of two integrators a motion that is too slow to be seen within 1e16 s
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     A, B, K = FOLLOWER
@@ -202,7 +202,7 @@ def test_period_limit_of_a_follower_is_the_same_in_turned_coordinates(angle: flo
 
 
 @pytest.mark.parametrize(("a", "b", "error"), [(3.0, 100.0, 1e-3), (20.0, 100.0, 0.1)])
-def test_period_limit_of_mixed_states_is_as_right_as_their_numbers(a: float, b: float, error: float) -> None:
+def test_period_limit_of_mixed_states_is_right_to_their_rounding(a: float, b: float, error: float) -> None:
     """All entries are exact, up to 4e6: the limit is 2 s over the gain. Periods of 1e-11 s were taken as unstable."""
     mix, back = np.array([[1.0, a], [b, 1.0 + a * b]]), np.array([[1.0 + a * b, -a], [-b, 1.0]])
     gain = 1.0 + 2.0**-10
@@ -220,7 +220,7 @@ def test_period_limit_of_an_unstable_loop_is_zero() -> None:
 
 
 @pytest.mark.parametrize("gain", [4.882, 4.8875])
-def test_a_loop_unstable_at_few_fractions_of_a_period_has_a_margin(gain: float) -> None:
+def test_loop_unstable_at_few_fractions_of_a_period_has_margin(gain: float) -> None:
     # a damped oscillation, sampled less than once: its loci have modulus one at a fiftieth of all fractions
     loop = [[0.0, 1.0], [-23.0, -1.4]], [[0.0], [1.0]], gain * np.array([[-0.5, 0.6]])
     looks = np.arange(0.0, 12.0, 0.005)

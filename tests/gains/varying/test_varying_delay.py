@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.errors import BadModelError
+from gains.core.semidefinite import Unknown, positive_definite_solution
 from gains.delay.constant import delay_margin
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import bound_covering, spread_bound

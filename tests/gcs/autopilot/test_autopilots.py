@@ -94,7 +94,7 @@ def test_a_message_that_is_missing_is_named(unsaid: int, words: str) -> None:
     assert Told(ARDUCOPTER, but=unsaid).advised() == (words, None)
 
 
-def test_an_unaccepted_rate_an_unknown_clock_and_an_unknown_origin_are_named() -> None:
+def test_unaccepted_rate_unknown_clock_and_unknown_origin_are_named() -> None:
     copter = Told(ARDUCOPTER)
     assert copter.advised(clock_known=False) == ("does not answer TIMESYNC", None)
     copter.startup.origin = None

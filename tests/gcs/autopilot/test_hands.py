@@ -96,7 +96,7 @@ def test_a_failsafe_takes_no_vehicle_from_its_pilot(autopilot: int, modes: tuple
     assert talk.vehicle.taken_over
 
 
-def test_who_arms_a_vehicle_in_the_mode_it_had_flies_it() -> None:
+def test_who_arms_a_vehicle_in_its_former_mode_flies_it() -> None:
     talk = Talk()
     talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x481)  # no position yet
     talk.heartbeat(STABILIZE, armed=False)

@@ -99,7 +99,7 @@ def test_losses_leave_the_same_response() -> None:
     assert seen.response.dead_time_s == pytest.approx(0.048, abs=1e-3)
 
 
-def test_a_jerk_limit_of_5_bends_a_square_but_not_this() -> None:
+def test_jerk_limit_of_5_bends_a_square_but_not_this() -> None:
     free, limited = found(flown(MODELS[2], 50.0)), found(flown(MODELS[2], 50.0, jerk_max_m_s3=5.0))
     assert free is not None
     assert limited is not None
@@ -124,7 +124,7 @@ def test_whatever_is_reported_is_a_fit_or_none(velocity: list[float]) -> None:
     assert fit is None or (math.isfinite(fit.misfit) and fit.response.lag_s > 0.0)
 
 
-def test_the_manoeuvre_ends_as_fast_as_it_began_and_is_smooth() -> None:
+def test_manoeuvre_is_smooth_and_returns_to_its_first_velocity() -> None:
     amplitude = amplitude_m_s2(3.0)
     acceleration = np.array([manoeuvre_m_s2(s, amplitude) for s in np.arange(0.0, LONGEST_S, 1e-3).tolist()])
     velocity = np.cumsum(acceleration) * 1e-3
@@ -135,7 +135,7 @@ def test_the_manoeuvre_ends_as_fast_as_it_began_and_is_smooth() -> None:
     assert amplitude_m_s2(0.5) == 0.25
 
 
-def test_the_run_up_ends_at_the_wanted_velocity_within_half_the_limit() -> None:
+def test_run_up_ends_at_the_wanted_velocity_within_half_limit() -> None:
     for limit_m_s2, most_m_s2 in ((3.0, 1.5), (1.0, 0.5), (None, 1.5)):
         ramp = run_up((3.0, -4.0), limit_m_s2)
         each = np.array([ramp.acceleration_m_s2(s) for s in np.arange(0.0, ramp.duration_s, 1e-3).tolist()])

@@ -106,7 +106,7 @@ def test_a_campaign_says_how_to_fly_its_code_again(
     assert "identical to the last bit" in capsys.readouterr().out
 
 
-def test_a_run_keeps_its_code_and_flies_again_from_its_folder(
+def test_a_run_keeps_its_code_and_flies_again_from_it(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = file.parent / "run"

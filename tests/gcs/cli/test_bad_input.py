@@ -91,7 +91,7 @@ def test_what_cannot_be_used_is_refused_before_the_work(
 
 
 @pytest.mark.parametrize("options", ["--front", "--at 0.3", "--front --method graph-dk"])
-def test_the_method_that_searches_no_gains_for_a_delay_is_refused_there(
+def test_a_method_that_cannot_search_for_delays_is_refused_there(
     options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (FOLDER / "chain3_bidirectional.toml").read_text(encoding="utf-8")
@@ -120,9 +120,7 @@ def test_what_is_no_scenario_is_named_in_plain_words(
         assert complaint(capsys, monkeypatch, *command.split(), str(path)) == f"{path}: {words}\n"
 
 
-def test_a_folder_does_not_hide_the_shipped_scenario_of_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_does_not_hide_a_shipped_scenarios_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "chain3").mkdir()
     monkeypatch.chdir(tmp_path)
     assert located("chain3").parent == FOLDER

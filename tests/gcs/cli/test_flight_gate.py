@@ -102,7 +102,7 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
     assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"
 
 
-def test_a_check_is_no_gate_for_autopilots_that_are_not_identified(
+def test_a_check_is_no_gate_for_autopilots_not_yet_identified(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Their margin is 600 ms if they respond at once, 445 ms as they do."""

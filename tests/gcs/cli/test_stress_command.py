@@ -84,7 +84,7 @@ def test_autopilots_are_refused_where_they_do_not_fly(option: str) -> None:
     assert done.stderr.endswith(wanted)
 
 
-def test_aircraft_are_refused_where_a_disturbance_of_the_errors_is_flown(tmp_path: Path) -> None:
+def test_aircraft_are_refused_where_disturbances_of_errors_are_flown(tmp_path: Path) -> None:
     text = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
     file = tmp_path / "aircraft.toml"
     file.write_text(text.replace("seed = 1", 'seed = 1\ndynamics = "jsbsim"', 1), encoding="utf-8")

@@ -129,7 +129,7 @@ def test_what_an_autopilot_reports_of_its_own_changes_nothing() -> None:
     assert link.gained_m_s(4) == pytest.approx(link.wanted_m_s2(4), abs=1e-9)
 
 
-def test_set_points_under_way_are_clipped_as_the_last_one_was() -> None:
+def test_set_points_under_way_are_clipped_like_the_last_one() -> None:
     link = Link()
     link.report(3, active(link.of(3)[0]))
     clipped = 1.0 * link.wanted_m_s2(4) / abs(link.wanted_m_s2(4))

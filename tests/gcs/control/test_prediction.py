@@ -181,7 +181,7 @@ def test_a_response_moves_as_its_differential_equation_says(response: Response) 
         assert [moved.real, moved.imag] == pytest.approx(position.tolist(), abs=1e-3)
 
 
-def test_jitter_of_the_age_does_not_move_when_set_points_act() -> None:
+def test_jitter_of_the_age_does_not_shift_set_point_times() -> None:
     """The age of a state is known: only its mean over two seconds counts against the assumed loop delay."""
     history, predicted, rng = StateHistory(1), states([CommandHistory(LONG)], 0.5), np.random.default_rng(5)
     assumed_ms = list[float]()

@@ -114,7 +114,7 @@ def test_limits_of_different_exchanges_outdo_the_best_one(seed: int) -> None:
     assert np.abs(offs_ns[128:]).max() < 4 * 60 / 129 * MS
 
 
-def test_a_way_that_slows_down_alone_does_not_shift_the_clock() -> None:
+def test_one_way_slowing_down_does_not_shift_the_clock() -> None:
     """By 1.5 s within a minute, which a line through the exchanges of the window would follow."""
     rng, truth = np.random.default_rng(1), Exchange(offset_ns=5 * S, drift=20e-6)
     for k in range(700):
@@ -126,7 +126,7 @@ def test_a_way_that_slows_down_alone_does_not_shift_the_clock() -> None:
 
 
 @pytest.mark.parametrize("begin_ms", range(20_000, 20_500, 25))
-def test_exchanges_during_a_change_of_both_ways_do_not_shift_the_clock(begin_ms: int) -> None:
+def test_exchanges_during_changes_of_both_ways_leave_the_clock(begin_ms: int) -> None:
     """Both ways slow down within 0.5 s. When earlier exchanges leave the window, asymmetric ones are its quickest."""
     truth = Exchange(offset_ns=5 * S, drift=10e-6)
     truth.clock.expected_error_ns = 5 * MS
@@ -379,7 +379,7 @@ def lying(*, usual_ms: int, share: float, slips: bool = False, minutes: int = 10
 
 @pytest.mark.parametrize("slips", [False, True])
 @pytest.mark.parametrize("share", [0.12, 0.47, 1.0])
-def test_errors_usual_for_the_kind_are_no_jumps_and_keep_bounds(share: float, slips: bool) -> None:
+def test_errors_usual_for_the_kind_keep_bounds_without_jumps(share: float, slips: bool) -> None:
     """Ten minutes at the error of ArduCopter; 12 and 47 % of exchanges are what was seen to contradict the others."""
     found = lying(usual_ms=5, share=share, slips=slips)
     assert found["jumps"] == 0
@@ -410,7 +410,7 @@ def test_a_jump_beyond_the_errors_of_stamps_is_called_one(by_ms: float) -> None:
     assert truth.clock.jumps == 1
 
 
-def test_a_state_a_little_ahead_of_the_clock_widens_its_bound() -> None:
+def test_a_state_slightly_ahead_of_the_clock_widens_its_bound() -> None:
     """All replies are dated back by 6 ms: exchanges alone cannot show it, states do."""
     truth = Exchange(offset_ns=0, drift=0.0)
     accepted: list[bool] = []

@@ -32,7 +32,7 @@ def asked_twice() -> RemoteVehicle:
     return vehicle
 
 
-def test_a_second_answer_to_a_request_is_none_to_the_next() -> None:
+def test_second_answer_to_a_request_is_none_to_the_next() -> None:
     vehicle = asked_twice()
     vehicle.acknowledge(ACCEPTED, NS_PER_S + 3)
     assert requested(vehicle.next_frame(2 * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
@@ -41,7 +41,7 @@ def test_a_second_answer_to_a_request_is_none_to_the_next() -> None:
     assert "telemetry rate" not in vehicle.missing
 
 
-def test_an_answer_after_a_round_trip_is_to_the_newest_request() -> None:
+def test_answer_after_a_round_trip_is_to_the_newest_request() -> None:
     vehicle = asked_twice()
     # the first copy was never answered: the vehicle was still booting
     vehicle.acknowledge(ACCEPTED, NS_PER_S + 2 + 3 * NS_PER_S // 10)
@@ -58,7 +58,7 @@ def test_a_request_is_repeated_until_it_is_answered_itself() -> None:
     assert "telemetry rate" in vehicle.missing
 
 
-def test_a_vehicle_with_nothing_left_to_command_awaits_answers_to_timesync() -> None:
+def test_vehicle_with_nothing_left_to_command_awaits_timesync_answers() -> None:
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
     vehicle.address, vehicle.heard_ns = 1, NS_PER_S
     for command in (SET_MESSAGE_INTERVAL, SET_MODE, ARM_DISARM):

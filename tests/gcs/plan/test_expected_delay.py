@@ -80,7 +80,7 @@ def test_on_board_the_slowest_state_that_a_command_needs_counts(name: str, expec
     assert flown_s == pytest.approx(expected_s, abs=0.01)  # half of a period, as phases happen to be
 
 
-def test_on_board_states_that_are_not_of_one_instant_are_waited_for() -> None:
+def test_on_board_states_of_different_instants_are_waited_for() -> None:
     """With slow telemetry the phases at which vehicles report decide, which differ from flight to flight."""
     scenario = load(FOLDER / "thesis_delay.toml").with_calm_monitor()
     slow = scenario.model_copy(
@@ -186,7 +186,7 @@ def test_states_lost_in_bursts_are_late_ones() -> None:
     assert expected_s > 0.2
 
 
-def test_a_given_delay_is_off_by_the_wait_for_the_tick() -> None:
+def test_given_delays_are_off_by_the_wait_for_the_tick() -> None:
     """Nobody knows it before a flight, in which it is the same throughout."""
     calm = calm_chain()
     rates = calm.rates.model_copy(update={"telemetry_hz": 10.0, "control_hz": 10.0})

@@ -40,7 +40,7 @@ def test_expected_and_late_loop_delays_are_those_of_flights() -> None:
     assert not found.channels_not_included
 
 
-def test_a_formation_that_would_be_broken_shows_its_delays_all_the_same() -> None:
+def test_a_formation_that_would_break_shows_its_delays_anyway() -> None:
     """Vehicle 3 starts 2.4 m off."""
     safety = RADIO.safety.model_copy(update={"spacing_error_limit_m": 1.0})
     found = check(flight_plan(RADIO.model_copy(update={"safety": safety}))[1])
@@ -63,7 +63,7 @@ class Counted:
 @pytest.mark.parametrize(
     "scenario", [RADIO, three().model_copy(update={"rates": RADIO.rates, "response": TRUTH})], ids=["plain", "copters"]
 )
-def test_a_channel_is_offered_what_its_vehicles_and_the_station_send(scenario: Scenario) -> None:
+def test_channel_is_offered_what_its_vehicles_and_station_send(scenario: Scenario) -> None:
     channel = Channel(name="radio", bandwidth_bit_s=1e6, bits_per_byte=10, queue_bytes=10_000, half_duplex=True)
     link = Link(delay_s=0.01, channel="radio")
     wide = scenario.model_copy(update={"links": Links(up=link, down=link, channels=(channel,)), "duration_s": 12.0})

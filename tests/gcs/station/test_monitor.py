@@ -175,7 +175,7 @@ def test_invariants_hold_for_any_history(history: list[tuple[float, bool, bool]]
 
 
 @given(st.lists(st.floats(0.0, 1.0) | st.just(nan), min_size=1, max_size=50))
-def test_the_judged_delay_is_the_90th_percentile_with_unknown_ones_as_the_longest(delays_s: list[float]) -> None:
+def test_the_judged_90th_percentile_counts_unknown_delays_as_longest(delays_s: list[float]) -> None:
     judged_s = _judged_delay_s(np.array([delays_s]), 0, len(delays_s), np.zeros(50))
     wanted_s = np.sort(delays_s)[min(len(delays_s) - 1, int(0.9 * len(delays_s)))]
     assert judged_s == wanted_s or (np.isnan(judged_s) and np.isnan(wanted_s))

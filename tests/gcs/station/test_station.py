@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs.link.datagram import Datagram, Outgoing, address_at
+from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.startup import WITHOUT_TARGET
 from gcs.link.vehicle import told_by
 from gcs.plan.flight_plan import FlightPlan
@@ -16,7 +16,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import Control
 from tests.support.paths import SCENARIOS
-from tests.support.station_peer import HOME, Peer, messages
+from tests.support.station_peer import HOME, Peer, address_at, messages
 
 S, MS = 1_000_000_000, 1_000_000
 SCENARIO = load(SCENARIOS / "chain3.toml")
@@ -60,7 +60,7 @@ def test_refused_commands_are_reported_and_tried_again_a_second_later() -> None:
     assert times[0] == 50  # the answer came at S
 
 
-def test_a_vehicle_that_does_not_report_its_active_target_is_named_and_flown() -> None:
+def test_vehicle_not_reporting_its_active_target_is_named_and_flown() -> None:
     predicted = SCENARIO.model_copy(update={"control": Control(prediction="measured")})
     station, peer = Station(replace(PLAN, scenario=predicted), start_ns=S), Peer(2)
     station.step([peer.heartbeat(S)], S)
@@ -96,7 +96,7 @@ def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
     assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
 
 
-def test_a_heartbeat_of_zeros_is_not_taken_for_one_that_changes_nothing() -> None:
+def test_a_heartbeat_of_zeros_disarms_like_any_other() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
     station.step([peer.heartbeat(S, base_mode=129, custom_mode=4)], S)
@@ -163,7 +163,7 @@ def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     assert station.vehicles[1].address == thief.address
 
 
-def test_a_vehicle_that_speaks_mavlink_1_is_named_as_such_until_it_speaks_mavlink_2() -> None:
+def test_mavlink_1_vehicle_is_named_until_it_speaks_mavlink_2() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = station.vehicles[1]
     old = peer.link.heartbeat_encode(2, 3, 1, 0, 3).pack(peer.link, force_mavlink1=True)

@@ -131,7 +131,7 @@ def test_a_check_has_the_headroom_of_each_vehicle() -> None:
     assert found.headroom == found.vehicles[2].headroom == pytest.approx(0.11 / 0.3)
 
 
-def test_loops_on_board_break_at_their_margin_over_links_that_differ() -> None:
+def test_loops_on_board_break_at_their_margin_over_different_links() -> None:
     scenario = with_links(load(located("thesis_delay")), all=0.05, v1=0.3)
     study = study_of(scenario)
     assert study.plan.delay_margin_s == pytest.approx(1.0022, abs=1e-4)

@@ -20,7 +20,7 @@ def short() -> Scenario:
     return load(RADIO).model_copy(update={"duration_s": 6.0})
 
 
-def test_loop_on_board_flies_at_rates_that_its_sensor_is_no_multiple_of(short: Scenario) -> None:
+def test_loop_on_board_flies_at_rates_not_dividing_its_sensors(short: Scenario) -> None:
     onboard = with_loop(short, "onboard", RADIO)
     assert onboard.onboard.sensor_hz % 20.0 != 0.0
     found = fly_loaded(onboard, 20.0, 2)

@@ -8,7 +8,7 @@ from scenarios.files import load
 from tests.support.paths import SCENARIOS
 
 
-def test_a_map_is_flown_by_one_worker_and_by_all_beside_another_cluster() -> None:
+def test_one_worker_or_all_fly_a_map_beside_another_cluster() -> None:
     with socket.socket() as taken:
         with contextlib.suppress(OSError):  # by another cluster indeed
             taken.bind(("127.0.0.1", 8787))  # Dask's usual port, which warns if it cannot have it

@@ -3,30 +3,17 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gains.design.design import design
 from gains.formation.model import FormationModel
 from gcs.cli.main import app
-from gcs.studies.compare import METHODS, string_peak
+from gcs.studies.compare import METHODS
 from gcs.studies.compare_cost import DesignCost, left_out
 from tests.support.paths import SCENARIOS
 
 SCENARIO = SCENARIOS / "chain3.toml"
 CHAIN = FormationModel((-1, 0, 1))
-
-
-def test_formation_string_peak_equals_that_of_two_followers() -> None:
-    found = design(CHAIN, period_s=0.02)
-    K = CHAIN.overlapping_gain(found.K1, found.K2, 1.4 * found.K3)
-    k1, k2, k3 = -found.K1[0, 0], found.K2[0, 0], 1.4 * found.K3[0, 0]
-    s = 1j * np.geomspace(1e-3, 1e2, 20000)
-    peak = np.abs((k2 * s + k3) / (s**2 + k1 * s + k3)).max()
-    assert peak > 1.05
-    assert string_peak(CHAIN, K) == pytest.approx(peak, rel=1e-4)
-    assert string_peak(FormationModel((-1, 0)), np.zeros((4, 6))) is None
 
 
 def test_routes_are_flown_and_shown_side_by_side(tmp_path: Path) -> None:

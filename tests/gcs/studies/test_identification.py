@@ -49,7 +49,7 @@ def test_a_known_lag_is_found_again(tmp_path: Path) -> None:
         assert found.misfit < 0.002
 
 
-def test_an_aircraft_flies_to_the_margin_computed_with_its_identified_response() -> None:
+def test_aircraft_flies_to_the_margin_computed_with_its_identified_response() -> None:
     scenario = parse(TEXANS, SCENARIOS / "texans.toml")
     found = responses_of(scenario)
     assert all(one.response.model == "second order" and one.misfit < 0.03 for one in found.values())

@@ -40,7 +40,7 @@ def test_the_tutorial_names_every_array() -> None:
 
 
 @pytest.mark.parametrize("library", ["pandas", "polars"])
-def test_table_becomes_a_data_frame_with_the_types_of_the_record(library: str) -> None:
+def test_table_becomes_a_data_frame_with_types_of_the_record(library: str) -> None:
     frames = pytest.importorskip(library)
     flight = gcs.fly_virtual(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0}))
     table = flight.table()

@@ -8,7 +8,7 @@ from scenarios.schema import Control, FixedGains, Rates
 from scenarios.shipped import located
 
 
-def test_a_flight_that_settled_says_how_long_vehicles_were_out_of_hand() -> None:
+def test_settled_flight_says_how_long_vehicles_were_out_of_hand() -> None:
     """The last vehicle is silent for 4 s, after which it is in failsafe for a tick or two."""
     calm = Link(delay_s=0.02)
     silent = calm.model_copy(update={"outages": (Outage(from_s=10.0, until_s=14.0),)})
@@ -22,7 +22,7 @@ def test_a_flight_that_settled_says_how_long_vehicles_were_out_of_hand() -> None
     assert {own.mode_final for own in summary.vehicles} == {"NOMINAL"}
 
 
-def test_margins_of_single_vehicles_are_not_taken_for_those_of_slower_gains() -> None:
+def test_margins_of_single_vehicles_are_not_mistaken_for_slower_gains() -> None:
     quick, slow = Link(delay_s=0.02), Link(delay_s=0.09)
     links = Links(up=quick, down=quick, vehicles=(VehicleLinks(system_id=3, up=slow, down=slow),))
     scenario = load(located("chain3_bidirectional")).model_copy(update={"links": links, "duration_s": 5.0})
@@ -34,7 +34,7 @@ def test_a_flight_in_hand_throughout_says_nothing_of_modes() -> None:
     assert "modes" not in flight_lines(fly_virtual(calm).summary)
 
 
-def test_a_flight_that_broke_is_not_told_that_errors_do_not_grow() -> None:
+def test_broken_flight_is_not_told_that_errors_do_not_grow() -> None:
     """Of the set-points 70 % are lost, which the station cannot see: by what it measures, much headroom is left."""
     calm, lossy = Link(delay_s=0.02), Link(delay_s=0.02, loss_probability=0.7)
     chain = load(located("chain3"))

@@ -183,7 +183,7 @@ def test_another_tools_log_gives_links_and_errors_but_no_verdict(requests: bool)
             assert np.median(np.abs(found[axis] - at_the_same_time)) < 0.01
 
 
-def test_a_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
+def test_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
     """Its pilot may fly it: the log does not say."""
     scenario = scenario_of("chain3")
     design, _, _, entries = flown(scenario)
@@ -225,7 +225,7 @@ def rebuilt_with(scenario: Scenario, vehicles: Vehicles, plan: FlightPlan | None
     return summarise(scenario, design, ticks, [*station.events, end]), rebuilt
 
 
-def test_a_vehicle_that_no_longer_answers_timesync_has_no_delay_in_its_log_either() -> None:
+def test_silence_on_timesync_leaves_no_delay_in_the_log_either() -> None:
     scenario = scenario_of("chain3").model_copy(update={"duration_s": 12.0})
     summary, rebuilt = rebuilt_with(scenario, Unanswering(scenario))
     assert (rebuilt.verdict, rebuilt.reason) == (summary.verdict, summary.reason) == ("unknown", COMPLETED)

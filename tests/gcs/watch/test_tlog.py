@@ -13,10 +13,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from gcs.errors import InputError
 from gcs.link import mavlink
-from gcs.link.datagram import Arrivals, Frames, address_at
+from gcs.link.datagram import Arrivals, Frames
 from gcs.runs.record import TLOG_FILE, RunWriter
 from gcs.watch.tlog import parse_tlog, read_tlog
 from scenarios.sockets import joined
+from tests.support.station_peer import address_at
 
 START_US = 1_750_000_000_000_000
 ENTRIES = [

@@ -298,7 +298,7 @@ def test_lost_positions_lengthen_the_effective_loop_delay() -> None:
 
 
 @pytest.mark.parametrize("asked", [False, True])
-def test_positions_come_if_asked_for_and_else_the_reason_is_told(asked: bool) -> None:
+def test_positions_come_if_requested_or_else_a_reason_is_given(asked: bool) -> None:
     """Copters send none by themselves, as ArduPilot. Those that do are not asked again."""
     watched = Watched(three(), timesync_hz=10.0, position_hz=20.0 if asked else 0.0)
     watched.run(8.0)
@@ -346,7 +346,7 @@ def test_slow_positions_are_told_with_what_they_do(
 
 
 @pytest.mark.parametrize(("delay_s", "failed"), [(0.2, True), (0.01, False)])
-def test_delays_past_the_margin_fail_although_the_vehicle_is_silent_now(delay_s: float, failed: bool) -> None:
+def test_delays_past_the_margin_fail_though_the_vehicle_is_silent(delay_s: float, failed: bool) -> None:
     watched = Watched(linked(Link(delay_s=delay_s), Link(delay_s=delay_s)), timesync_hz=10.0)
     watched.run(5.0)
     figures = watched.watch.figures(watched.now_ns + 4_000 * MS, Design(delay_margin_s=0.3))
@@ -407,7 +407,7 @@ def test_a_delay_is_unknown_once_exchanges_have_stopped() -> None:
 
 @pytest.mark.parametrize("margin_s", [None, 0.3])
 @pytest.mark.parametrize(("stopped_s", "judged"), [(0.0, True), (3.0, True), (5.0, False), (10.0, False)])
-def test_what_has_a_margin_passes_only_if_its_delay_is_known_at_the_end(
+def test_link_with_margin_passes_only_if_last_delay_is_known(
     margin_s: float | None, stopped_s: float, judged: bool
 ) -> None:
     """Of 10 s, the last 2.5 count. Exchanges that stopped are missed after two seconds."""
@@ -425,7 +425,7 @@ def test_what_has_a_margin_passes_only_if_its_delay_is_known_at_the_end(
 
 
 @pytest.mark.parametrize(("silent_s", "longest_s"), [(1.2, 1.2), (1.8, 0.05), (2.5, 0.05)])
-def test_a_silence_after_which_a_flight_would_lose_the_vehicle_is_no_latency(silent_s: float, longest_s: float) -> None:
+def test_silence_that_would_lose_a_vehicle_is_no_latency(silent_s: float, longest_s: float) -> None:
     """States at 20 Hz. The looks before the gap ends are up to 0.15 s early."""
     watch, peer, now_ns = Watch([1]), Peer(1), 0
     for tick in range(400):

@@ -99,7 +99,7 @@ def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
 
 
 @pytest.mark.parametrize("rows", [6, 7, 50])
-def test_nothing_is_lost_when_there_is_no_room_for_more_records(rows: int) -> None:
+def test_nothing_is_lost_when_no_more_records_have_room(rows: int) -> None:
     link = Link(delay_s=0.03, loss_probability=0.1, duplicate_probability=0.2, corrupt_probability=0.05)
     own = scenario(COUNT).model_copy(update={"links": Links(up=link, down=link)})
     roomy, narrow = MemoryRecorder(), MemoryRecorder(rows)

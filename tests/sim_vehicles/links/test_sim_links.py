@@ -82,7 +82,7 @@ def test_a_ramp_is_exact_at_given_instants() -> None:
     }
 
 
-def test_a_datagram_longer_than_a_frame_fares_as_a_short_one() -> None:
+def test_datagram_longer_than_a_frame_fares_as_a_short_one() -> None:
     behaviour = link_keys.Link(
         delay_s=0.1,
         jitter=Jitter(distribution="normal", scale_s=0.1),

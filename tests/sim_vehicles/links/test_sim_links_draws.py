@@ -183,7 +183,7 @@ def test_an_added_effect_leaves_the_other_draws(change: dict[str, float]) -> Non
     assert all(before[number] == after[number] for number in common)
 
 
-def test_a_link_with_jitter_alone_draws_only_that_and_the_same_as_with_loss() -> None:
+def test_jitter_alone_draws_only_that_and_as_with_loss() -> None:
     with_loss = link_keys.Link(jitter=Jitter(distribution="gamma", scale_s=0.01, shape=2.5), loss_probability=0.1)
     drawn: list[Any] = []
     for link in (with_loss, with_loss.model_copy(update={"loss_probability": 0.0})):

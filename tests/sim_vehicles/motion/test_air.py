@@ -111,7 +111,7 @@ def test_reports_are_wrong_by_the_noise_and_bias_asked_for() -> None:
     assert np.allclose(np.stack(logged, axis=1), off, rtol=0.0, atol=1e-9)
 
 
-def test_an_all_pass_filter_turns_the_phase_and_keeps_the_size() -> None:
+def test_an_all_pass_filter_turns_phase_and_keeps_the_size() -> None:
     c, angle = -0.8, 0.3
     signal = np.exp(1j * angle * np.arange(400))
     filters = AllPass((c, 1.0), 2)

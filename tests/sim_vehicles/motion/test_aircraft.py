@@ -44,7 +44,7 @@ def test_holds_speed_course_and_altitude() -> None:
     assert abs(aircraft.attitude().climbed_m) < 0.1
 
 
-def test_an_acceleration_to_the_right_is_flown_as_a_coordinated_turn() -> None:
+def test_acceleration_to_the_right_is_flown_as_a_coordinated_turn() -> None:
     aircraft, state = flown(Command(0.0, 2.0), 10.0)
     north, east = state.velocity_ne_m_s()
     # the reference lags by 2 ζ / ω = 0.8 s
@@ -60,7 +60,7 @@ def test_throttle_accelerates_along_the_course() -> None:
     assert abs(state.speed_m_s - SPEED_M_S - 0.5 * (10.0 - 0.8)) < 0.1
 
 
-def test_pieces_of_time_do_not_matter_and_what_is_foreseen_is_not_remembered() -> None:
+def test_aircraft_forget_what_they_foresee_and_steps_do_not_matter() -> None:
     _, whole = flown(Command(0.3, 0.3), 4.2, piece_s=0.06)
     one = scenario()
     aircraft, state = Aircraft(one, one.vehicles[0]), State(0.0, 0.0, 0.0, SPEED_M_S)

@@ -92,7 +92,7 @@ def test_set_points_that_stop_are_flown_on_for_three_seconds() -> None:
     assert vehicle.craft.mode == vehicle.craft.rules.guided_mode  # it stands in GUIDED
 
 
-def test_it_says_why_it_cannot_be_armed_by_itself_and_at_each_try() -> None:
+def test_it_says_why_it_cannot_be_armed_unasked_and_asked() -> None:
     vehicle = copter(ready_after_s=38.0, arming_refusals=1)
     assert tell(vehicle, arm(), 5.0, "STATUSTEXT")[0].text == "Arm: Need Position Estimate"
     by_itself = parse_all(vehicle.step([], START + 37 * SECOND), "STATUSTEXT")
