@@ -33,12 +33,12 @@ class Figure:
 _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "quick": (figures.design, figures.margin_held, figures.margin_thesis, figures.readme_onset),
     "exact": (
-        *(figures.onset_chain3, figures.string_limit, figures.compare, figures.prediction_windows),
-        *(figures.prediction_price, figures.prediction_flights),
+        *(figures.string_limit, figures.compare, figures.prediction_windows),
+        figures.prediction_price,
     ),
     "slow": (
         *(figures.onsets, figures.one_link, figures.maps, figures.capacity, figures.copters_onset),
-        figures.thesis_flights,  # the tests fly the same
+        *(figures.onset_chain3, figures.prediction_flights, figures.thesis_flights),  # tests fly the like
     ),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),

@@ -1,8 +1,6 @@
 """The monitor over UDP on the real clock: the verdicts and the modes of virtual time, flight by flight."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +13,7 @@ from scenarios.files import dump, load
 from scenarios.keys.link import DelayPoint, Jitter, Link, Links
 from scenarios.schema import Monitor, Scenario
 from tests.support.paths import SCENARIOS
+from tests.support.processes import gcs
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -32,11 +31,12 @@ FLOWN: dict[str, Scenario] = {
     "acting": TRIANGLE.model_copy(
         update={"duration_s": 32.0, "links": ramp((4.0, 0.02), (16.0, 0.44), (19.0, 0.44), (23.0, 0.02))}
     ),
+    "nominal": TRIANGLE.model_copy(update={"duration_s": 12.0, "links": Links(up=CALM, down=CALM)}),
     "watching": TRIANGLE.model_copy(
         update={"duration_s": 32.0, "links": ramp((4.0, 0.02), (16.0, 0.44)), "monitor": Monitor(act=False)}
     ),
-    "nominal": TRIANGLE.model_copy(update={"duration_s": 12.0, "links": Links(up=CALM, down=CALM)}),
 }
+ENDED = {"acting": "completed", "nominal": "completed", "watching": "broken"}
 
 
 def modes(events: list[dict[str, object]], system_id: int) -> set[str]:
@@ -45,29 +45,21 @@ def modes(events: list[dict[str, object]], system_id: int) -> set[str]:
     return {text.split("-> ")[1].split()[0] for text in texts}
 
 
-def test_over_udp_verdicts_and_modes_are_those_of_virtual_time(tmp_path: Path) -> None:
-    flights: dict[str, subprocess.Popen[str]] = {}
-    for name, scenario in FLOWN.items():
-        file = tmp_path / f"{name}.toml"
-        file.write_text(dump(scenario), encoding="utf-8")
-        command = [sys.executable, "-m", "gcs.cli.main", "fly", str(file), "--listen", "127.0.0.1:0", "--json"]
-        flights[name] = subprocess.Popen(
-            [*command, "--out", str(tmp_path / name)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-    ended: dict[str, str] = {}
-    for name, scenario in FLOWN.items():
-        station = Station(flight_plan(scenario)[1], start_ns=START_NS)
-        for _ in fly_lockstep(station.plan, station=station):
-            pass
-        out, err = flights[name].communicate(timeout=100.0)
-        assert err == ""
-        ended[name] = str(json.loads(out)["reason"]).split(":")[0]
-        assert ended[name] == station.end_reason.split(":")[0], name
-        lines = (tmp_path / name / "events.jsonl").read_text(encoding="utf-8").splitlines()
-        real, virtual = [json.loads(line) for line in lines], [event_fields(event) for event in station.events]
-        for vehicle in scenario.vehicles:
-            flown = modes(real, vehicle.system_id)
-            assert flown >= modes(virtual, vehicle.system_id), (name, vehicle.system_id)
-            # a busy machine delays more than the links do, but not by the margin
-            assert name != "nominal" or "CRITICAL" not in flown
-    assert ended == {"acting": "completed", "watching": "broken", "nominal": "completed"}
+@pytest.mark.slow(first=2)
+@pytest.mark.parametrize("name", FLOWN)
+def test_over_udp_verdict_and_modes_are_those_of_virtual_time(name: str, tmp_path: Path) -> None:
+    scenario, file = FLOWN[name], tmp_path / f"{name}.toml"
+    file.write_text(dump(scenario), encoding="utf-8")
+    done = gcs("fly", file, "--listen", "127.0.0.1:0", "--json", "--out", tmp_path / name)
+    station = Station(flight_plan(scenario)[1], start_ns=START_NS)
+    for _ in fly_lockstep(station.plan, station=station):
+        pass
+    assert done.stderr == ""
+    assert str(json.loads(done.stdout)["reason"]).split(":")[0] == station.end_reason.split(":")[0] == ENDED[name]
+    lines = (tmp_path / name / "events.jsonl").read_text(encoding="utf-8").splitlines()
+    real, virtual = [json.loads(line) for line in lines], [event_fields(event) for event in station.events]
+    for vehicle in scenario.vehicles:
+        flown = modes(real, vehicle.system_id)
+        assert flown >= modes(virtual, vehicle.system_id), vehicle.system_id
+        # a busy machine delays more than the links do, but not by the margin
+        assert name != "nominal" or "CRITICAL" not in flown

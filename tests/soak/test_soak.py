@@ -29,7 +29,7 @@ UNDRAWN = {"FormationChange", "ChangedOffset", "Sector", "Criteria", "CodeFile"}
 """Parts that only tests of their own fly: the invariants expect errors of one shape that decay, and quick designs."""
 
 
-@pytest.mark.slow(first=4)
+@pytest.mark.slow(first=2)
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_flights_break_no_invariant(part: int) -> None:
     found = {number: judge(experiment(SEED, number)).broken for number in range(part * FLIGHTS, (part + 1) * FLIGHTS)}

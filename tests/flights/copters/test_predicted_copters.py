@@ -91,7 +91,7 @@ def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
     assert {way.string_peak for way in ways[1:]} == {1.0}
 
 
-@pytest.mark.slow(first=2)
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("aim", AIMS)
 @pytest.mark.parametrize("prediction", ["on", "off"])
 def test_gains_for_a_delay_decay_in_flight_as_computed(aim: Aim, prediction: Literal["on", "off"]) -> None:

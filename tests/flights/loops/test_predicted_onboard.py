@@ -73,6 +73,7 @@ def test_errors_change_at_the_rate_of_the_certificate(loop_s: float) -> None:
     assert (growth > 0.0) == (not 0.771 < known(outcome.loop_delay_s) < 1.337)
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("prediction", [1.0, "measured"])
 def test_a_predicted_triangle_settles_at_five_times_its_margin(prediction: float | str) -> None:
     _, plan = flight_plan(triangle(prediction, link_s=0.99))

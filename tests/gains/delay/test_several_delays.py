@@ -197,7 +197,7 @@ def test_box_of_curves_must_be_finite(longest_s: tuple[float, float]) -> None:
         crossing_curves([[-1.0]], [[1.0]], [[1.0]], longest_s=longest_s)
 
 
-@pytest.mark.slow(first=12)
+@pytest.mark.slow(first=8)
 @pytest.mark.parametrize("seed", range(24))
 def test_curves_reach_the_axes(seed: int) -> None:
     now, first, second = random_loop(seed)

@@ -130,6 +130,7 @@ def test_double_integrator_in_position_and_position_plus_velocity() -> None:
     assert found.checked_by == ("sweep", "rightmost root")
 
 
+@pytest.mark.slow(first=3)
 @pytest.mark.parametrize("group", range(GROUPS))
 def test_integrators_in_any_unimodular_coordinates_have_a_margin(group: int) -> None:
     for seed in range(group, 420, GROUPS):

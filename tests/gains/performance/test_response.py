@@ -123,6 +123,7 @@ def test_a_gain_of_another_formation_is_refused() -> None:
         formation_loop(FormationModel((-1, 0, 1)), K, [Response(0.1, 1.0)] * 3)
 
 
+@pytest.mark.slow(first=4)
 @pytest.mark.parametrize("response", RESPONSES[:2])
 @pytest.mark.parametrize("timing", [Timing(0.02, 0.02), Timing(0.02, 0.1), Timing(0.05, 0.03)], ids=str)
 def test_a_design_for_a_response_has_the_margin_asked_for(response: Response, timing: Timing) -> None:

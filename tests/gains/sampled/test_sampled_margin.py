@@ -60,7 +60,7 @@ def random_loop(seed: int) -> tuple[Loop, float]:
     return (A - (rightmost + 0.4) * np.eye(n), B, K), float(10.0 ** rng.uniform(-1.0, 0.0))
 
 
-@pytest.mark.slow(first=30)
+@pytest.mark.slow(first=20)
 @pytest.mark.parametrize("seed", range(60))
 def test_margin_is_where_the_spectral_radius_reaches_one(seed: int) -> None:
     loop, period_s = random_loop(seed)

@@ -39,6 +39,7 @@ def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:
     return Flight(station, fleet, np.concatenate(ticks), station.events)
 
 
+@pytest.mark.slow(first=1)
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_a_vehicle_given_back_far_behind_returns_to_stable_flight(flavour: str) -> None:
     flight = flown(flavour, {5.0: PILOTS_MODE[flavour], 20.0: RULES[flavour].guided_mode})
