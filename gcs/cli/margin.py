@@ -146,7 +146,6 @@ def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dic
 
 def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None:
     from gcs.views.console import plain_console, table_of
-    from gcs.views.report import windows_table
 
     console = plain_console()
     if isinstance(found, LoopAtGivenDelays):
@@ -173,6 +172,8 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
     for note in margin.notes:
         console.print(note)
     if isinstance(found, ScenarioMargin) and found.prediction is not None:
+        from gcs.views.report import windows_table
+
         console.print(windows_table(found.prediction))
 
 
