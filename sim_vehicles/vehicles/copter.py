@@ -201,10 +201,8 @@ class Copter:
         guided = self.mode == self.rules.guided_mode
         if reason:
             if guided and self.rules.velocity_grows and self.flying:
-                self._takeoff_m, self._target = (
-                    None,
-                    self._own_target(),
-                )  # ArduCopter stops at a set-point that it refuses
+                # ArduCopter stops at a set-point that it refuses
+                self._takeoff_m, self._target = None, self._own_target()
             return reason
         self._setpoint_ns = time_ns  # PX4 also counts those before offboard: they allow it to enter that mode
         if not guided or not self.armed:

@@ -90,12 +90,8 @@ def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) 
     """Fly the acceleration that the station commands in flight or, of a copter, velocity and acceleration."""
     if frame[1] != _SETPOINT_BYTES or frame[5] != vehicle.station or not takes_setpoints(vehicle):
         return NEEDS_PYTHON
-    mask, component, judged, counted = (
-        read_uint16(frame, PAYLOAD + 48),
-        frame[PAYLOAD + 51],
-        AXES | FORCE_SET,
-        ACCELERATION,
-    )
+    mask, component = read_uint16(frame, PAYLOAD + 48), frame[PAYLOAD + 51]
+    judged, counted = AXES | FORCE_SET, ACCELERATION
     if vehicle.copter:
         judged, counted = judged | _NO_TURN, VELOCITY_ACCELERATION | _NO_TURN
     if mask & judged != counted or frame[PAYLOAD + 52] != LOCAL_NED or (vehicle.copter and is_led(vehicle)):
@@ -118,9 +114,7 @@ def _take_setpoint(vehicle: Record, frame: Frame, time_ns: int, truth: Records) 
     _move(vehicle, acts_ns)
     if vehicle.copter:
         acceleration, gain, growth = complex(north, east), vehicle.velocity_gain_1_s, vehicle.growth
-        set_target(
-            vehicle, Target(acceleration, velocity, gain, growth, climb, nan, nan, 0.0, complex(nan, nan))
-        )  # fmt: skip
+        set_target(vehicle, Target(acceleration, velocity, gain, growth, climb, nan, nan, 0.0, complex(nan, nan)))
     else:
         set_command(vehicle, Command(north, east, 0.0, 0.0, 0.0))
     vehicle.setpoints += 1
