@@ -379,3 +379,4 @@ def prepare(scenario: schema.Scenario) -> None:
             now_ns = tenth * NS_PER_S // 10
             fleet.step([(key, data, now_ns) for key, data in zip(fleet.system_ids, frames, strict=True)], now_ns)
         fleet.step((), 3 * NS_PER_S)
+        fleet.vehicle(fleet.system_ids[0]).radio.encoder.timesync(1, 1)  # as in answer to a datagram of several frames
