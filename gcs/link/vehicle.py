@@ -552,7 +552,7 @@ class RemoteVehicle:
         if self.address is None or self.idle:
             return None
         settled = self._settled and self.goal is Goal.FLY
-        if settled:
+        if settled:  # the start-up sees every position, as when it is asked for its next step
             self._pass_position()
         frame = None if settled else self._next_command(now_ns)
         if frame is None and self.goal is Goal.FLY:

@@ -368,7 +368,10 @@ class Fleet:
 
 
 def prepare(scenario: schema.Scenario) -> None:
-    """Compile the kernels before real time begins, by flying plain vehicles for seconds, with a log and without."""
+    """Compile the kernels before real time begins.
+
+    Plain vehicles fly for seconds, with a log and without; copters, if any, stand on the ground and move once.
+    """
     if scenario.dynamics == "autopilot":
         advance(Motion(0j, inner=inner_of(scenario.autopilot)), Target(), scenario.autopilot, 0.02)
         Fleet(scenario.model_copy(update={"links": Links()}), 0).step((), NS_PER_S)

@@ -91,6 +91,7 @@ class Stream:
         self._fates, self._delays = map(np.random.default_rng, seeds.spawn(2))
         self._jitter = link.jitter
         self._only_delays = constant(link.model_copy(update={"jitter": None}))
+        self._trace_s, self._at = np.zeros(1), 0
         if link.jitter is not None and link.jitter.distribution == "trace":
             self._trace_s = np.array(link.jitter.trace_s or (0.0,))
             self._at = int(self._delays.integers(len(self._trace_s)))
