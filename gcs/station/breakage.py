@@ -29,13 +29,11 @@ _TIME_CONSTANTS = 3.0
 def not_formed(plan: FlightPlan, history: Reports) -> str:
     """Why the flight cannot begin: a vehicle is too far from its place behind the one in front. Empty if none is."""
     limit_m, ids = plan.scenario.safety.spacing_error_limit_m, plan.formation.system_ids
-    for row in plan.model.followers:
-        newest = history.newest(row)
-        ahead = None if newest is None else history.at(plan.model.predecessors[row], newest[0])
-        if newest is None or ahead is None:
-            continue
-        north, east = plan.formation.offset_ne_m[row].tolist()
-        error_m = hypot(newest[1][0] - ahead[0] - north, newest[1][1] - ahead[1] - east)
+    followers = np.array(plan.model.followers, np.int64)
+    times_ns, newest = history.every_newest()
+    ahead = history.every_at(np.array(plan.model.predecessors)[followers], times_ns[followers])
+    errors_ne_m = (newest[followers] - ahead)[:, :2] - plan.formation.offset_ne_m[followers]
+    for row, error_m in zip(followers.tolist(), np.hypot(*errors_ne_m.T).tolist(), strict=True):
         if error_m > limit_m:
             far = beyond(error_m, limit_m)
             return f"not formed: vehicle {ids[row]} is {far} m from its place at the start, limit {limit_m:g} m"

@@ -206,7 +206,7 @@ class FormationMonitor:
 
     @property
     def states(self) -> list[VehicleState]:
-        return [self._state(self._states, row) for row in range(len(self._states))]
+        return _in_python(self._states)
 
     def update(self, seen: Seen) -> list[tuple[int, VehicleState, VehicleState]]:
         """Judge a tick. Returns row, old and new state of each vehicle whose mode, gain set or release changed."""
@@ -214,8 +214,9 @@ class FormationMonitor:
         count = judge(self.watched, seen, self.policy, self.separable)
         changed: list[int] = self._changed[:count].tolist()
         first = self._next_to_release() if changed else -1
-        for row in changed:
-            before, after = self._state(self._states, row), self._state(self._after, row)
+        for row, before, after in zip(
+            changed, _in_python(self._states[changed]), _in_python(self._after[changed]), strict=True
+        ):
             if after.released and not before.released and row != first:
                 after = after._replace(mode=Mode.CRITICAL, released=False)  # a vehicle behind it is released first
                 self._after[row] = after
@@ -226,11 +227,6 @@ class FormationMonitor:
             self.away, self._troubled, self._settled_s = self._rows(_AWAY), self._rows(_TROUBLED), inf
         self._open(seen.time_s, flying=seen.flying)
         return changes
-
-    @staticmethod
-    def _state(states: Records, row: int) -> VehicleState:
-        mode, *rest = states[row].item()
-        return VehicleState(Mode(mode), *rest)
 
     def _rows(self, modes: tuple[Mode, ...]) -> list[int]:
         """The rows of the vehicles in any of these modes."""
@@ -279,3 +275,7 @@ class FormationMonitor:
         goal = self._keys.open_factor if late and self._keys.act and flying else 1.0
         step = (self._keys.open_factor - 1.0) * self._period_s / self._keys.open_s
         self.opening += min(step, max(-step, goal - self.opening))
+
+
+def _in_python(states: Records) -> list[VehicleState]:
+    return [VehicleState(Mode(mode), *rest) for mode, *rest in states.tolist()]

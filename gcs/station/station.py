@@ -48,8 +48,8 @@ from scenarios.schema import NS_PER_S
 
 _REQUESTS_APART_NS = 7_000_000
 """Minimum time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
-_IN_A_TICK = 250
-"""Maximum number of vehicles whose start-up is advanced in one tick; if there are more, they take turns."""
+_IN_A_TICK = 50
+"""Maximum number of vehicles that are started or told of a change in one tick; if there are more, they take turns."""
 Tolerances = tuple[FloatArray, FloatArray]
 """How much shorter and longer than assumed each vehicle's loop delay may be, both (n, sets)."""
 _NEAR = 0.1
@@ -127,8 +127,10 @@ class Station:
         self._guided, self._critical = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
-        self._rows, self._ready, self._busy = range(n), 0, set(range(n))
-        """`_busy`: rows of vehicles for which a command may be due."""
+        self._rows, self._to_check, self._busy = range(n), [*range(n)], set(range(n))
+        """`_to_check`: rows of vehicles that `_all_ready` has to check; `_busy`: those for which a command may be due."""
+        self._announcements: list[tuple[RemoteVehicle, Mode, str]] = []
+        """Changes that vehicles are not yet told."""
         self._absent, self._gone = [""] * n, dict[int, bool]()
         """Why each vehicle is absent, "" if it is not; and those absent, by row, with whether pilots fly them."""
         self._returning: dict[int, bool] = {}
@@ -198,7 +200,7 @@ class Station:
         """
         time_s, flying = self.scenario_time_s(self.next_tick_ns), self.phase is Phase.FLYING
         self._coming["quiet_until_ns"] = 0.0
-        waiting = self._reception.touched or self._gone or self._returning
+        waiting = self._reception.touched or self._gone or self._returning or self._announcements
         if waiting or not self._monitor.is_calm(time_s, flying=flying):
             return False
         if flying and (self._journal.stop or self._busy or not self._breakage.all_back):
@@ -410,14 +412,15 @@ class Station:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
                 self._busy.add(row)
             if after.mode is not before.mode:
-                self._change_mode(row, before.mode, after.mode, outgoing)
+                self._change_mode(row, before.mode, after.mode)
             if after.released != before.released and flying:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)
             if after.gain_set != before.gain_set and flying:
                 margin_s = self._monitor.margins_s[row][after.gain_set]
                 self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
-                self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
+                self._announcements.append((vehicle, after.mode, f"{GAIN_SET}{after.gain_set}"))
+        self._announce(outgoing)
         self._next_phase(due_ns)
 
     def _in_turn(self, rows: Sequence[int]) -> Sequence[int]:
@@ -426,14 +429,17 @@ class Station:
         return rows if len(rows) <= _IN_A_TICK else [*rows, *rows][first : first + _IN_A_TICK]
 
     def _all_ready(self) -> bool:
-        """Whether all vehicles are ready or left out. The one that was not at the last call is checked first."""
+        """Whether all vehicles are ready or left out: of many, some are checked at each call.
 
-        def ready(row: int) -> bool:
+        The one that was not ready at the last call is checked first, and all others after it.
+        """
+        for row in self._to_check[:_IN_A_TICK]:
             vehicle = self.vehicles[row]
-            return vehicle.left_out or (vehicle.ready and bool(self._history.newest(row)))
-
-        self._ready = next((row for row in self._rows[self._ready :] if not ready(row)), 0)
-        return ready(self._ready) and all(map(ready, self._rows))
+            if not (vehicle.left_out or (vehicle.ready and self._history.newest(row))):
+                self._to_check = [*self._rows[row:], *self._rows[:row]]
+                return False
+        del self._to_check[:_IN_A_TICK]
+        return not self._to_check
 
     def _look_at(self, rows: Iterable[int]) -> None:
         """Update the state derived from these vehicles, which may have changed."""
@@ -487,11 +493,11 @@ class Station:
 
     # -- sending and reporting -------------------------------------------------------------------------------------
 
-    def _change_mode(self, row: int, before: Mode, after: Mode, outgoing: Outbox) -> None:
+    def _change_mode(self, row: int, before: Mode, after: Mode) -> None:
         """Report a change of mode; the vehicle may be CRITICAL because its headroom is unknown."""
         vehicle = self.vehicles[row]
         self._report("mode", f"{before.name} -> {after.name}", vehicle.system_id)
-        self._tell(vehicle, after, after.name, outgoing)
+        self._announcements.append((vehicle, after, after.name))
         if after is Mode.CRITICAL and vehicle.clock.unanswered >= UNANSWERED and np.isnan(self._used_s[row]):
             self._report("vehicle", "does not answer TIMESYNC: its loop delay is unknown", vehicle.system_id)
 
@@ -502,9 +508,10 @@ class Station:
         if self.phase is Phase.ENDED and late:
             self._report(NOT_CONFIRMED, in_words("", late))
 
-    def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: Outbox) -> None:
-        """Announce a change on the link, for other listeners and the telemetry log."""
-        if vehicle.external:
-            return
-        fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
-        vehicle.send(mavlink.STATUSTEXT, fields, outgoing)
+    def _announce(self, outgoing: Outbox) -> None:
+        """Announce changes on the link, for other listeners and the telemetry log; of many, the oldest."""
+        for vehicle, mode, text in self._announcements[:_IN_A_TICK]:
+            if not vehicle.external:
+                fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
+                vehicle.send(mavlink.STATUSTEXT, fields, outgoing)
+        del self._announcements[:_IN_A_TICK]
