@@ -321,7 +321,7 @@ class Station:
         due_ns = self.next_tick_ns
         behind = (self._journal.now_ns - due_ns) // self.period_ns
         self.next_tick_ns = due_ns + (behind + 1) * self.period_ns  # missed ticks are skipped
-        self._decide(due_ns, outgoing)
+        self._decide(due_ns)
         self._fleet.locate(self._history)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
@@ -338,7 +338,12 @@ class Station:
         shorten(points["velocity_ned_m_s"], self._speed_max_m_s)  # last, to apply to all set-points alike
         shorten(points["acceleration_ne_m_s2"], self._limits.acceleration_m_s2)
         self._fleet.loop.sent(due_ns, points)
+        few = len(self.vehicles) <= _IN_A_TICK
+        if few:
+            self._announce(outgoing)
         indices = self._add_set_points(set_points_to(self._fleet.links, points, self._targets, key_ms), outgoing)
+        if not few:
+            self._announce(outgoing)  # last, as the set-points of many vehicles take milliseconds to send
         for row in self._in_turn(sorted(self._busy)):
             frame = self.vehicles[row].next_frame(self._journal.now_ns)
             if frame is not None and (address := self.vehicles[row].address) is not None:
@@ -383,7 +388,7 @@ class Station:
             [why != "" for why in self._absent], [row in self._returning for row in range(len(self._absent))]
         )
 
-    def _decide(self, due_ns: int, outgoing: Outbox) -> None:
+    def _decide(self, due_ns: int) -> None:
         """Update modes, absent vehicles and the phase of the flight."""
         flying = self.phase is Phase.FLYING
         silent = self._journal.now_ns - self._reception.telemetry_ns > self._limits.silence_ns
@@ -420,7 +425,6 @@ class Station:
                 margin_s = self._monitor.margins_s[row][after.gain_set]
                 self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
                 self._announcements.append((vehicle, after.mode, f"{GAIN_SET}{after.gain_set}"))
-        self._announce(outgoing)
         self._next_phase(due_ns)
 
     def _in_turn(self, rows: Sequence[int]) -> Sequence[int]:
