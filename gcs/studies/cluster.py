@@ -1,5 +1,6 @@
 """A map of trials on Dask with one local worker and with several: the cost of distribution, and how far it scales."""
 
+import logging
 import pickle
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from itertools import product
@@ -94,7 +95,8 @@ def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
     make: Any = LocalCluster  # its type hints do not allow synchronous use
     # its HTTP server runs even without a dashboard; without an explicit port it takes 8787, and warns if that is in use
     http = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
-    with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", scheduler_kwargs=http) as cluster:
+    quiet = {"silence_logs": logging.CRITICAL}  # interrupted workers log tracebacks as errors
+    with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", scheduler_kwargs=http, **quiet) as cluster:
         with dask_workers(cluster.scheduler_address, _not_flown) as answer:
             list(answer(unflown[:1]))  # the workers' imports
             used_s = time.process_time()
