@@ -57,7 +57,7 @@ def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
 def real_matrix(name: str, value: ArrayLike) -> FloatArray:
     """`value` as a matrix of finite real numbers with at least one entry; BadModelError names it otherwise."""
     try:
-        matrix = np.array(value)
+        matrix = np.array(value)  # a copy: the caller may change what it passed
     except (OverflowError, ValueError) as error:
         raise BadModelError(f"{name} is ragged; rows of equal length are wanted") from error
     if matrix.dtype.kind not in "fiub":
@@ -66,7 +66,7 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
         raise BadModelError(f"{name} has shape {matrix.shape}; a matrix with at least one row and column is wanted")
     if not np.isfinite(matrix).all():
         raise BadModelError(f"{name} has entries that are not finite; finite numbers are wanted")
-    return matrix.astype(np.float64)  # a copy: the caller may change what it passed
+    return matrix.astype(np.float64, copy=False)
 
 
 def positive_seconds(name: str, value: float) -> float:

@@ -227,7 +227,7 @@ def _assess(
     flown, K_flown = (gains[0], gains[1] + share * gains[0], gains[2]), fed_forward(formation, K, share)
     alpha = robustness(*flown)
     margin_s = sampled_delay_margin(A, B, K_flown, period_s=period_s)
-    continuous_s = delay_margin(A, B @ K_flown)
+    continuous_s = delay_margin(A, formation.feedback(K_flown))
     leader, follower = (block_margin(*block) for block in diagonal_blocks(gains))
     blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
     if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array, eye_array
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
@@ -133,8 +133,8 @@ def verify_inclusion(
     V, U, R, Q = expansion.V, expansion.U, expansion.R, expansion.Q
     A_, B_, K_, K_e = csr_array(A), csr_array(B), csr_array(K), csr_array(K_expanded)
     conditions = {
-        "UV = I": U @ V - csr_array(np.eye(V.shape[1])),
-        "QR = I": Q @ R - csr_array(np.eye(R.shape[1])),
+        "UV = I": U @ V - eye_array(V.shape[1]),
+        "QR = I": Q @ R - eye_array(R.shape[1]),
         "A~V = VA": expansion.A @ V - V @ A_,
         "K = QK~V": Q @ K_e @ V - K_,
     }
@@ -156,8 +156,14 @@ def verify_inclusion(
 
 def _disjoint(formation: FormationModel, matrix: Callable[[FormationModel], FloatArray]) -> Sparse:
     """Block diagonal matrix over the subsystems (3.25): the leader, and each follower with its predecessor."""
-    leader, pair = (csr_array(matrix(FormationModel(who, formation.axes))) for who in ((-1,), (-1, 0)))
-    return csr_array(block_diag([leader, *[pair] * len(formation.followers)], format="csr"))
+    leader, pair = (matrix(FormationModel(who, formation.axes)) for who in ((-1,), (-1, 0)))
+    (top, left), (row, column) = leader.nonzero(), pair.nonzero()
+    copies = np.arange(len(formation.followers))[:, np.newaxis]
+    rows = np.concatenate([top, (len(leader) + copies * len(pair) + row).ravel()])
+    columns = np.concatenate([left, (leader.shape[1] + copies * pair.shape[1] + column).ravel()])
+    values = np.concatenate([leader[top, left], np.tile(pair[row, column], len(copies))])
+    height, width = np.array(leader.shape) + len(copies) * np.array(pair.shape)
+    return csr_array((values, (rows, columns)), shape=(height, width))
 
 
 def _copied_blocks(formation: FormationModel) -> tuple[list[int], list[int]]:

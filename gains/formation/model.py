@@ -148,7 +148,17 @@ class FormationModel:
 
         All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as for `overlapping_gain`.
         """
-        return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
+        return self.A, self.feedback(self.overlapping_gain(K1, K2, K3))
+
+    def feedback(self, K: FloatArray) -> FloatArray:
+        """B K, (states, states), for a gain K (inputs, states): its rows, placed. Large formations multiply slowly.
+
+        >>> FormationModel((-1, 0), axes=1).feedback(np.array([[-3.0, 0.0, 0.0], [2.0, 1.0, -3.0]])).tolist()
+        [[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 1.0, -3.0]]
+        """
+        product = np.zeros((self.states, self.states))
+        product[~self.spacing_mask] = K
+        return product
 
     def narrowed(self, K: FloatArray) -> tuple["FormationModel", FloatArray]:
         """The formation and gain of one axis, if K (inputs, states) acts on every axis alike; else both unchanged."""
@@ -159,9 +169,9 @@ class FormationModel:
 
     def coupled_vehicles(self, K: FloatArray) -> list[list[int]]:
         """Groups of vehicles that act on each other under the gain K (inputs, states), driving groups first."""
-        outputs = [self.output_slice(i) for i in range(self.vehicles)]
-        pattern = np.abs(self.A) + np.abs(self.B @ K)
-        acts = np.array([[pattern[own, other].sum() for other in outputs] for own in outputs])
+        starts = [self.output_slice(i).start for i in range(self.vehicles)]
+        pattern = np.abs(self.A) + np.abs(self.feedback(K))
+        acts = np.add.reduceat(np.add.reduceat(pattern, starts, axis=0), starts, axis=1)
         return [members.tolist() for members in strongly_connected_blocks(acts)]
 
     def _known(self, vehicle: int) -> int:

@@ -116,7 +116,7 @@ class Breakage:
 def slowest_decay_1_s(plan: FlightPlan) -> float:
     """Decay rate in 1/s, without delay, of the slowest gains in the schedule, with which a vehicle returns."""
     model = plan.model
-    closed_loop = model.A + model.B @ plan.gains[-1]
+    closed_loop = model.A + model.feedback(plan.gains[-1])
     loops = [closed_loop]
     if plan.separable:
         own = [model.output_slice(row) for row in range(model.vehicles)]
