@@ -2,7 +2,7 @@
 
 The prediction assumes that every set-point acts, one delivery delay after it was due. A lost one never acts: the
 vehicle holds the previous one. A report shows which set-point the vehicle holds at an instant. It carries the vehicle's
-own time and no set-point key, so the set-point is matched by value, as float32 in both directions. For ArduPilot the
+own time and no set-point key, so set-points are matched by value, rounded to float32 as on the link. For ArduPilot the
 acceleration is matched, because the reported velocity grows with it; ArduPilot stores it in cm/s², which moves about a
 quarter of all values to the neighbouring float32. For PX4 the velocity is matched, because the reported acceleration is
 that of its velocity loop. Our own vehicles report only the acceleration.
@@ -29,7 +29,7 @@ from gcs.control.prediction import CommandHistory
 from gcs.link.mavlink import VELOCITY_IGNORED
 
 _AGES = 3
-"""Set-points over which the least age is taken: few, as a longer delay looks like loss until all of them show it."""
+"""Set-points over which the least age is taken: few, because an increased delay looks like loss until all show it."""
 _EARLY = 0.05
 """A set-point is expected to act this share of a period before it reaches the least age: clocks err by as much."""
 _ASIDE = 0.02
@@ -41,7 +41,7 @@ _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
 _ON_THE_WIRE = struct.Struct("<2f")
 
 
-def _extrapolated(vector: Sequence[float]) -> complex:
+def _rounded(vector: Sequence[float]) -> complex:
     """North + 1j * east, rounded to float32 as on the link."""
     return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*vector)))
 
@@ -67,7 +67,7 @@ class ActiveTargets:
         self._velocity: list[complex] = []
         self._acceleration: list[complex] = []
         self._off: list[complex] = []
-        """Correction of each acceleration."""
+        """The correction added to each acceleration."""
         self._ages_ns, self._aged_ns = deque[int](maxlen=_AGES), 0
         self._largest_m_s2 = inf
         """The magnitude to which the vehicle clips."""
@@ -75,8 +75,8 @@ class ActiveTargets:
     def sent(self, due_ns: int, velocity_m_s: Sequence[float], acceleration_m_s2: Sequence[float]) -> None:
         """Record a set-point as it was sent, north and east; `history` must already hold it."""
         self._due_ns.append(due_ns)
-        self._velocity.append(_extrapolated(velocity_m_s))
-        self._acceleration.append(_extrapolated(acceleration_m_s2))
+        self._velocity.append(_rounded(velocity_m_s))
+        self._acceleration.append(_rounded(acceleration_m_s2))
         self._off.append(0j)
         self._clip_from(len(self._off) - 1)
         old = bisect_left(self._due_ns, due_ns - 9 * self._held_ns)
@@ -85,16 +85,16 @@ class ActiveTargets:
 
     def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
         """Process the fields of a report; `at_ns` is its instant on the station's clock."""
-        acceleration, only = _extrapolated(fields[_ACCELERATION]), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
+        acceleration, only = _rounded(fields[_ACCELERATION]), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
         recent = range(oldest, bisect_right(self._due_ns, at_ns))
         value, same = acceleration, [place for place in recent if _is_same(acceleration, self._acceleration[place])]
         if not same and not only:
-            value = _extrapolated(fields[_VELOCITY])
+            value = _rounded(fields[_VELOCITY])
             same = [place for place in recent if _is_same(value, self._velocity[place])]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
-            # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages
+            # zeros are left out, as a stopped vehicle reports them too; repeated reports would only add growing ages
             self._aged_ns = self._due_ns[same[0]]
             self._ages_ns.append(at_ns - self._aged_ns)
             expected = self._expected(at_ns)

@@ -24,7 +24,7 @@ class Fleet:
     """The vehicles of one flight, in formation order: in the air from the beginning, in one common frame.
 
     `report` takes events of vehicles as (kind, text, system id). `law` is the user's own control law, if it is flown.
-    `starts` holds each vehicle's start-up if they begin on the ground. For `strangers` see `LaunchedStartup`.
+    `starts` holds each vehicle's start-up if they begin on the ground. For `strangers` see `Startup.stranger`.
     """
 
     speaks_mavlink_1_first = False
@@ -99,7 +99,7 @@ class Fleet:
             self._law.report()
 
     def bound(self, controls: Records, blends: Records) -> None:
-        """Limit the control law's commands to what the vehicles can follow; these follow all within scenario limits."""
+        """Limit the control law's commands to what the vehicles can follow: for these, scenario limits suffice."""
 
     def locate(self, history: StateHistory) -> None:
         """Update `frame_ned_m` once the origins of the vehicles' frames become known."""

@@ -7,8 +7,8 @@ computed from it acts:
 
 * *up*: the telemetry delay. *Waiting*: until the control tick. *Computing*: until the set-point has been handed to the
   kernel. Their sum is the age of the state when the set-point is sent.
-* *down*: the set-point delay. It is not measured for each set-point but taken from the newest TIMESYNC request, so
-  with jitter the two differ.
+* *down*: the set-point delay. It is not measured for each set-point but taken from the newest TIMESYNC request; with
+  jitter, the two delays differ.
   With `control.execute_at`, vehicles hold set-points: *down* then ends when the set-point acts, as the vehicle reports.
 * *repetition*: when telemetry is slower than control, several commands are computed from one state. The repetition
   does not count as delay, because the margin already accounts for the telemetry period. The extra age caused by lost

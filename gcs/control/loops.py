@@ -163,7 +163,7 @@ class StreamedLoop(Loop):
         super().__init__(plan)
         own, model = own_part(plan.model, plan.gain), plan.model
         self._opened_m_s2 = np.zeros((model.vehicles, 2))
-        """K_ii^p times the offset: to be added when the spacing is doubled, of which the loop on board is unaware."""
+        """K_ii^p times the offset: to be added at doubled spacing, as the loop on board keeps the designed spacing."""
         for i in model.followers:
             on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
             self._opened_m_s2[i] = on_spacing @ plan.formation.offset_ne_m[i]
@@ -182,7 +182,7 @@ class StreamedLoop(Loop):
         return controls
 
     def _open(self, commands_m_s2: FloatArray, opening: float) -> None:
-        """Add to commands (n, 2) the part for a wider spacing, of which the loops on board are unaware."""
+        """Add to commands (n, 2) the part for a wider spacing, as the loops on board keep the designed spacing."""
         commands_m_s2 += (opening - 1.0) * self._opened_m_s2
 
     def set_points(self, orders: Orders) -> Records:
@@ -264,5 +264,5 @@ def _deliveries(plan: FlightPlan) -> list[Delivery]:
 
 
 def _gains(plan: FlightPlan, lost: Sequence[bool], returning: Sequence[bool] | None) -> tuple[Any, ...]:
-    """The gain schedule, or the one that replaces it while the others fly without a vehicle."""
+    """The gain schedule, or the one that replaces it while vehicles are lost or returning."""
     return plan.around_loss if plan.around_loss and any((*lost, *(returning or ()))) else plan.gains

@@ -51,7 +51,7 @@ class ManoeuvringLoop(Loop):
         self._velocity_m_s, self._more_m_s2 = (np.zeros((plan.model.vehicles, 2)) for _ in range(2))
         """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
         self.law, self.parameters = inner.law, inner.parameters
-        self.sent, self.active = inner.sent, inner.active  # they use differences only, from which the plan cancels
+        self.sent, self.active = inner.sent, inner.active  # use only differences, in which the planned motion cancels
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Records, now: TickInputs) -> Records:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion

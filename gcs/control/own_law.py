@@ -54,7 +54,7 @@ class FlownLaw:
         self._bad_in_a_row = 0
 
     def commands(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
-        """The acceleration of each vehicle, or zero if the law's is unusable. The states of lost vehicles are NaN."""
+        """The acceleration of each vehicle; zero where the law's is unusable. The states of lost vehicles are NaN."""
         lost: list[bool] = np.isnan(states[:, 0]).tolist()
         clock_ns, fault = self._clock_ns, ""
         began_ns = 0 if clock_ns is None else clock_ns()

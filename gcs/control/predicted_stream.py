@@ -70,7 +70,7 @@ class StreamPrediction:
         self._streamed[~held] = 0.0
         self._inputs.append(self._streamed - np.array([K @ target for K in self._on_velocity]))
         self._target = target
-        if self._due_ns[0] < due_ns - 2.0 * KEPT_S * NS_PER_S:  # in bulk
+        if self._due_ns[0] < due_ns - 2.0 * KEPT_S * NS_PER_S:  # many at once, see `CommandHistory.add`
             old = bisect_right(self._due_ns, due_ns - round(KEPT_S * NS_PER_S))
             del self._due_ns[:old], self._responses[:old], self._inputs[:old]
         self._delivery_ns: list[int | None] = []
@@ -91,7 +91,7 @@ class StreamPrediction:
         return min((0 if report is None else report[0] for report in newest), default=0)
 
     def states(self, row: int) -> tuple[int, float, list[State]] | None:
-        """When a vehicle's set-point acts (ns), the assumed loop delay (s), and all states then, seen from the leader.
+        """When a vehicle's set-point acts (ns), its assumed loop delay (s), and all states then relative to the leader.
 
         None while a needed state or the vehicle's own delivery delay is unknown, or a needed vehicle is lost.
         """

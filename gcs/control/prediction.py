@@ -31,7 +31,7 @@ from scenarios.schema import NS_PER_S
 KEPT_S = 3.0 * PREDICTION_MAX_S
 """How long set-points are remembered: longer than any assumed delay, because states may be older than assumed."""
 FASTEST = 0.1
-"""Largest rate of change of an assumed delay, in s per s."""
+"""Largest rate of change of an assumed delay, in s/s."""
 _SMOOTHED_S = 2.0
 """Time constant of the filter for measured delivery delays, and averaging time of the ages from which D is derived."""
 _AHEAD_S = 5.0
@@ -92,7 +92,7 @@ class CommandHistory:
         self._sent.append(self._after(self._sent[-1], _Sent(due_ns, complex(*acceleration_m_s2), self._responds.rest)))
         self._due_ns.append(due_ns)
         long_ago = bisect_right(self._due_ns, due_ns - round(KEPT_S * NS_PER_S)) - 1
-        if 2 * long_ago > len(self._sent):  # in bulk: deleting from the front moves all the rest
+        if 2 * long_ago > len(self._sent):  # many at once, because deleting from the front moves all the rest
             del self._sent[:long_ago], self._due_ns[:long_ago]
         self._known = len(self._sent)
 
@@ -207,8 +207,8 @@ Delivery = FixedDelivery | MeasuredDelivery
 class FirstUses:
     """Moving average of the age of one vehicle's states at their first use by a tick.
 
-    The window is one common period of the control and telemetry rates. If D is a given loop delay minus this age, it is
-    about `_SMOOTHED_S`: each state's age is known, so its jitter must not change D (`gains.varying.predicted`).
+    The window is one common period of the control and telemetry rates; if D is a given loop delay minus this age, about
+    `_SMOOTHED_S`. Each state's age is known, so its jitter must not change D (`gains.varying.predicted`).
     """
 
     def __init__(self, timing: Timing, *, given: bool) -> None:

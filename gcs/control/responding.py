@@ -1,4 +1,4 @@
-"""The motion of a vehicle that follows its set-points with a response, such as an autopilot's lag; for prediction.
+"""For prediction: the motion of a vehicle that follows its set-points with a response, such as an autopilot's lag.
 
 The acceleration a follows the commands u with a linear time-invariant response (`gains.performance.response`). In modal
 coordinates m,
