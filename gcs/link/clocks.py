@@ -103,10 +103,10 @@ CLOCK = np.dtype(
         ("unmatched", "i8"),  # replies that match no request
         ("expected_error_ns", "i8"),  # largest stamp error usual for this kind of vehicle
         ("stamp_error_ns", "f8"),  # largest stamp error that contradictions between exchanges have shown
-        ("lost", "?"),  # known to have jumped, but not yet by how much
+        ("lost", "?"),  # the clock is known to have jumped, but not yet by how much
         ("asked_ns", "i8"),  # when the last request was sent
         ("unanswered", "i8"), ("waits_ns", "i8"),  # requests since the newest answered one; when the first was sent
-        ("doubtful_state", "?"),
+        ("doubtful_state", "?"),  # a state was refused since the newest exchange
         ("newest_boot_ns", "i8"),  # boot time of the newest accepted state since the last jump
         ("count", "i8"),  # exchanges since the last jump
         ("pending", "i8"),  # requests without a reply
@@ -237,7 +237,7 @@ def request(clock: Record, pending_ns: NDArray[np.int64], now_ns: int) -> int:
 
 @kernel
 def answers(clock: Record, now_ns: int) -> bool:
-    """Whether it still answers requests. If it does not, its link down may be slower than known, or dead."""
+    """Whether a vehicle still answers requests. If not, its link down may be slower than last measured, or dead."""
     waited_ns = now_ns - clock.waits_ns
     return clock.unanswered < UNANSWERED or waited_ns <= UNANSWERED_NS + 3 * clock.rtt_ns
 
@@ -481,7 +481,7 @@ def _stay_within_limits(clock: Record, at_ns: int) -> None:
     if clock.in_doubt:
         limits = _joined(limits, _limits_in(clock.limits_in_doubt), False)
     one_ns, other_ns = _low_at(limits, at_ns), _high_at(limits, at_ns)
-    low_ns, high_ns = min(one_ns, other_ns), max(one_ns, other_ns)  # crossed by errors of stamps
+    low_ns, high_ns = min(one_ns, other_ns), max(one_ns, other_ns)  # stamp errors may make them cross
     offset_ns = min(max(offset_at_ns(known, at_ns), low_ns), high_ns)
     clock.bound_ns = max(high_ns - offset_ns, offset_ns - low_ns) + round(_stamps_off_ns(clock))
     clock.samples, clock.offset_ns, clock.reference_ns = min(clock.count, WINDOW), offset_ns, at_ns

@@ -11,20 +11,20 @@ NEW, LATE, DUPLICATE = 0, 1, 2
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
 _RATE_NS = NS_PER_S
-"""The frame rate is measured over intervals of this length, weighted by the factor below for each interval of age. To
-count the losses of a minute's outage correctly, it must be known to about half a per cent, whatever the jitter."""
+"""The frame rate is measured over intervals of this length; each interval of age multiplies a weight by `_OLDER`. To
+count the losses of a minute's outage correctly, the rate must be known to about half a per cent despite jitter."""
 _OLDER = 0.9
 _AHEAD, _LEAST_AHEAD = 127, 32
 """A frame may be this many numbers newer than its time suggests, because the newest one may itself have been late. The
-farther frames have recently been overtaken, the smaller this allowance, down to the second figure."""
+farther frames have recently been overtaken, the smaller this allowance, down to `_LEAST_AHEAD`."""
 _MOST = 0xFFFFFFFF
-"""The largest count that the tick record holds; a log whose clock jumps by centuries would exceed it."""
+"""The largest count that the tick record holds. Without this limit, a log whose clock jumps by centuries exceeds it."""
 _FORGET = 1.0 / 512
 _LONGEST = 9e18
 """Upper limit of expected frames times 1e9; beyond it more than `_MOST` are lost, so their number does not matter."""
 _RUN, _RUN_STEP = 8, 4
-"""This many late frames in a row, each at most the second figure newer than the last, are new after all: an earlier,
-very late frame was mistaken for a new one."""
+"""`_RUN` late frames in a row, each at most `_RUN_STEP` newer than the last, are new after all: an earlier, very late
+frame was mistaken for a new one."""
 
 
 COUNTER = np.dtype(

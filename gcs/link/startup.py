@@ -34,7 +34,7 @@ class Startup(Protocol):
     stays_disarmed: str = ""
     """Why the station must not arm it: it has landed, or somebody has disarmed it. Empty if it may."""
     stranger: bool = False
-    """Whether the vehicle has yet to say that it is simulated; until then it is commanded nothing."""
+    """Whether the vehicle has yet to say that it is simulated; until then it is sent no commands."""
     arming_refusals: int = 0
     """Number of refusals to arm since it was last armed."""
 
@@ -43,7 +43,7 @@ class Startup(Protocol):
         """Whether it has climbed to half of its take-off altitude or more."""
         return False
 
-    def is_news(self, text: str) -> bool:  # noqa: ARG002 - most vehicles seldom speak
+    def is_news(self, text: str) -> bool:  # noqa: ARG002 - most vehicles do not repeat themselves
         """Whether a text from the vehicle is new, not a repetition."""
         return True
 
@@ -91,7 +91,7 @@ class LaunchedStartup(Startup):
         self._first_asked_ns, self._last_asked_ns = inf, -inf
         """When a stranger was asked for its scenario."""
 
-    def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - it is what the scenario says
+    def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - the scenario gives the kind
         return LAUNCHED
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:

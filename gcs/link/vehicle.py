@@ -46,7 +46,7 @@ ARMED = 0x80
 _MOST_NAMED = 10
 STATE_CRITICAL = 5
 _LONGEST_HOLD_NS = 5 * NS_PER_S
-"""A vehicle that holds set-points starts anew if their arrival changes by more than this."""
+"""The longest plausible hold of a set-point: vehicles forget a lag that exceeds a new one by more than this."""
 
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
@@ -67,16 +67,16 @@ LINK = np.dtype(
         ("first_heard_ns", "i8"),  # when the first one arrived, or 0
         ("launched", "?"),  # it has no autopilot: only changes of its heartbeats matter, and it has no global position
         ("heartbeat_ns", "i8"),  # when the newest heartbeat arrived
-        ("heartbeat", "i8"),  # `told_by` a heartbeat that would change nothing; 0: none
+        ("heartbeat", "i8"),  # `heartbeat_state` of a heartbeat that would change nothing; 0: none
         ("newest", "?"),  # the last frame processed was sent after all the others
-        ("told", "i8"),  # frame-order faults already reported, as bits 1 << LATE and 1 << DUPLICATE
+        ("orders_reported", "i8"),  # frame-order faults already reported, as bits 1 << LATE and 1 << DUPLICATE
         ("left_out", "?"),  # see `RemoteVehicle`
         ("sequence", "i8"),  # of the last frame sent to it
         ("lag_ms", "i8"),  # reported lag after which held set-points act
         ("lag_jumps", "i8"),  # clock jumps counted when it was reported; -1: never reported
         ("local_ms", "i8"),  # time_boot_ms of its newest LOCAL_POSITION_NED
         ("local", "f8", (6,)),  # position and velocity in it
-        ("local_is_new", "?"),  # the start-up has not yet been told of it
+        ("local_is_new", "?"),  # it has not yet been passed to the start-up
     ],
     align=True,
 )
@@ -84,14 +84,14 @@ LINK = np.dtype(
 
 
 _KIND = 0xFFFF << 32
-"""Bits of `told_by`: the kinds of vehicle and autopilot."""
+"""Bits of `heartbeat_state`: the kinds of vehicle and autopilot."""
 
 
 @kernel
-def told_by(heartbeat: int) -> int:
-    """What the first 8 bytes of a heartbeat tell: custom mode, kinds, whether it is armed and whether it is critical.
+def heartbeat_state(heartbeat: int) -> int:
+    """The state in the first 8 bytes of a heartbeat: custom mode, kinds, and whether it is armed or critical.
 
-    Other modes and states follow from these, or concern nobody.
+    The other bits follow from these, or are not used.
     """
     return heartbeat & 0x80FFFFFFFFFFFF | (heartbeat >> 56 & 0xFF == STATE_CRITICAL) << 56
 
@@ -164,7 +164,7 @@ def ask(
         if not known[row].address:
             continue
         if now_ns - known[row].heard_ns > SILENCE_S * NS_PER_S:
-            clocks[row].unanswered = 0  # it says nothing at all: that is silence
+            clocks[row].unanswered = 0  # it sends nothing at all, which counts as silence
         rows[place] = row
         known[row].sequence = (known[row].sequence + 1) & 0xFF
         ts1_ns = request(clocks[row], pending_ns[row], now_ns)
@@ -233,7 +233,7 @@ class RemoteVehicle:
     """When the newest heartbeat arrived."""
     _launched, _heartbeat = Cell[bool](), Cell[int]()
     _local_ms, _local_is_new = Cell[int](), Cell[bool]()
-    _told, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
+    _orders_reported, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
 
     def __init__(
         self,
@@ -335,7 +335,7 @@ class RemoteVehicle:
 
     @property
     def awaits_clock(self) -> bool:
-        """Whether it lacks only answers to TIMESYNC, so is sent nothing else until it has them: it has no autopilot."""
+        """Whether it lacks only answers to TIMESYNC, and is sent nothing else until it has them; never an autopilot."""
         if self.clock.samples >= LEAST_SAMPLES or self.kind.piloted or self.left_out or self.goal is not Goal.FLY:
             return False
         return self.guided and self._next_step().command is None
@@ -365,7 +365,7 @@ class RemoteVehicle:
         return _MAVLINK_1 if missing and self.speaks_mavlink_1 else missing
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:
-        """A frame to this vehicle, with sequence numbers of its own, by which the vehicle can count losses."""
+        """A frame to this vehicle. Each vehicle gets its own sequence numbers, by which it can count losses."""
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
 
@@ -386,12 +386,12 @@ class RemoteVehicle:
         """Whether a frame was received before, or is a heartbeat that a newer frame has overtaken.
 
         Links that reorder or repeat frames cause this all the time: it is counted in `frames` and reported once.
-        A restarted vehicle restarts its numbers: FORGET_NUMBERS_NS after the last valid heartbeat, any one is accepted.
+        A restarted vehicle restarts its numbers, so FORGET_NUMBERS_NS after the last valid heartbeat any is accepted.
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
         order = self.frames.add(frame.sequence, now_ns)
-        if order != NEW and not self._told >> order & 1:
-            self._told |= 1 << order
+        if order != NEW and not self._orders_reported >> order & 1:
+            self._orders_reported |= 1 << order
             self.report_order(order)
         self.newest = order == NEW
         if heartbeat and now_ns - self.heartbeat_ns > FORGET_NUMBERS_NS:
@@ -538,7 +538,7 @@ class RemoteVehicle:
         self._expect(self._heartbeat & _KIND)
 
     def _expect(self, kind: int) -> None:
-        """Note what a heartbeat tells that would change nothing, given its bits of `_KIND`."""
+        """Record the `heartbeat_state` that would change nothing, given its bits of `_KIND`."""
         self._heartbeat = self.custom_mode | kind | self.armed << 55 | self.critical << 56
 
     def next_frame(self, now_ns: int) -> bytes | None:
@@ -565,7 +565,7 @@ class RemoteVehicle:
         return frame
 
     def final_command(self) -> bytes | None:
-        """The command to hold or land, of a station that cannot wait for the answer; None if it is not to be given."""
+        """The command to hold or land, from a station that cannot wait for the answer; None if none is needed."""
         if self.address is None or self.ended:
             return None
         command, parameters = mode_command(self.kind, self.end_mode)
@@ -624,8 +624,8 @@ class RemoteVehicle:
         return Step(step.missing) if self.external and not asks else step
 
     def end(self, *, alone: bool = False) -> None:
-        """Let it hold or land from now on, or leave it alone. What is not answered yet is repeated no more, but for a
-        mode: an answer does not say which mode it is to."""
+        """Let it hold or land from now on, or leave it alone. A pending command is dropped, unless it sets a mode: its
+        ACK does not name the mode, and could be taken for that of the next mode command."""
         self.goal = None if alone else Goal.END
         if self._command is not None and self._command.command != SET_MODE:
             self._command = None

@@ -29,7 +29,7 @@ from gcs.link.mavlink import (
     unsigned_at,
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
-from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns, told_by
+from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns, heartbeat_state
 from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
@@ -327,8 +327,8 @@ def _take_frame(
     elif msg_id == TIMESYNC:
         known = tc1_ns != 0 or link.launched  # a reply, or a request
     elif msg_id == HEARTBEAT:
-        told = told_by(int64(unsigned_at(stream, payload, 8, payload_end)))
-        same = link.heartbeat != 0 and told == link.heartbeat
+        shown = heartbeat_state(int64(unsigned_at(stream, payload, 8, payload_end)))
+        same = link.heartbeat != 0 and shown == link.heartbeat
         known = link.launched and same and received_ns - link.heartbeat_ns <= FORGET_NUMBERS_NS
     else:
         known = link.launched
@@ -337,8 +337,8 @@ def _take_frame(
     link.heard_ns = received_ns
     link.first_heard_ns = link.first_heard_ns or received_ns
     order = count(tables.counters[row], int64(stream[begin + 4]), received_ns)
-    if order != NEW and not link.told >> order & 1:
-        link.told |= 1 << order
+    if order != NEW and not link.orders_reported >> order & 1:
+        link.orders_reported |= 1 << order
         _note(tables.news, tables.news_count, _ORDER, row, order, 0)
     link.newest = order == NEW
     if order == DUPLICATE:

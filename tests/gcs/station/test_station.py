@@ -9,7 +9,7 @@ import pytest
 
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.startup import WITHOUT_TARGET
-from gcs.link.vehicle import told_by
+from gcs.link.vehicle import heartbeat_state
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.station.station import Station
@@ -116,7 +116,7 @@ def test_a_heartbeat_of_zeros_disarms_like_any_other() -> None:
 def test_a_heartbeat_tells_of_modes_kinds_arming_and_failsafe(name: str, value: int, matters: bool) -> None:
     fields = {"custom_mode": 4, "type": 2, "autopilot": 3, "base_mode": 129, "system_status": 4}
     one, other = (
-        told_by(int.from_bytes(struct.pack("<IBBBB", *each.values()), "little"))
+        heartbeat_state(int.from_bytes(struct.pack("<IBBBB", *each.values()), "little"))
         for each in (fields, fields | {name: value})
     )
     assert (one != other) == matters
