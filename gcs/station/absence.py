@@ -1,4 +1,4 @@
-"""Absent vehicles: lost, left out, disarmed, or flown by a pilot or by the autopilot on its own account."""
+"""Absent vehicles: lost, left out, landed, disarmed, or flown by a pilot or by the autopilot on its own account."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,9 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
 
 
 GROUNDED = (HAS_LANDED, WAS_DISARMED)
-"""Reasons for absence of a vehicle on the ground; others may fly over it."""
+"""Why a vehicle on the ground is absent; others may fly over it."""
 PILOTED = (TAKEN_OVER, *GROUNDED)
-"""Reasons for absence of a vehicle that its pilot flies, or has landed or disarmed."""
+"""Why a vehicle is absent that its pilot flies, or has landed or disarmed."""
 
 
 def describe_change(was: str, now: str) -> str:

@@ -3,7 +3,7 @@
 It takes the common datagrams of `gcs.station.reception`, sends requests and heartbeats, and does a control tick of a
 formation whose loop the station closes without prediction: in flight, if every vehicle is heard, guided and nominal;
 before and after the flight, while the station only waits for answers. These steps call the same kernels as the steps in
-Python, which take over wherever these stop.
+Python, which take over wherever a fast step stops.
 """
 
 from math import inf, isfinite, isnan
@@ -138,13 +138,13 @@ COMING = np.dtype(
         ("velocity_ne_m_s", "f8", (2,)),  # nominal
         ("zero_ns", "i8"), ("before_s", "f8"),  # `Journal.zero`
         ("since_ns", "i8"),  # when the phase began
-        # Python does the ticks from these times on, in ns, s of the phase and scenario time
+        # Python does the ticks from these times on: station clock in ns, seconds of the phase, and scenario time
         ("quiet_until_ns", "f8"), ("longest_s", "f8"), ("steady_until_s", "f8"),
-        ("clock_row", "i8"),  # and those after the clock of this vehicle has become known; -1 for none
+        ("clock_row", "i8"),  # and the ticks after the clock of this vehicle has become known; -1 for none
     ],
     align=True,
 )  # fmt: skip
-"""What Python says of the coming ticks."""
+"""What fast steps need to know of the coming ticks; `Station.look_ahead` fills it in."""
 
 
 @array_kernel

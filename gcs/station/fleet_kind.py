@@ -13,8 +13,8 @@ from gcs.plan.flight_plan import FlightPlan
 def fleet_of(plan: FlightPlan, report: Report, law: FlownLaw | None = None, *, strangers: bool = False) -> Fleet:
     """The fleet for a plan; `report` takes events of its vehicles as (kind, text, system id).
 
-    `law` is the user's own control law, if it is flown. `strangers` must say that they are simulated, unless the plan
-    is for vehicles with autopilots.
+    `law` is the user's own control law, if it is flown. With `strangers`, vehicles must say that they are simulated,
+    unless the plan is for vehicles with autopilots.
     """
     if plan.scenario.dynamics == "autopilot":
         return AutopilotFleet(plan, report)

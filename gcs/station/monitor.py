@@ -5,8 +5,8 @@ avoid jumps in the commands.
 
 As headroom shrinks, the monitor acts in this order:
 
-1. CRITICAL: the vehicle's gains change to the next slower set of the schedule, which has a larger margin. So they do
-   if headroom is unknown.
+1. CRITICAL, as also if headroom is unknown: the vehicle's gains change to the next slower set of the schedule, which
+   has a larger margin.
 2. Still CRITICAL on the slowest set: the whole formation opens to `open_factor` times its spacing.
 3. No headroom on the slowest set: vehicles are released to their failsafe, those farthest down the tree first.
 
@@ -66,7 +66,7 @@ class Seen(NamedTuple):
 def _rank(seen: int) -> int:
     """Index of the judged delay, the 90th percentile, among those seen, sorted in ascending order with NaN last.
 
-    So the delay of a vehicle is unknown if a tenth or more of its ticks are.
+    So the delay of a vehicle is unknown if it is unknown at a tenth or more of the ticks.
     """
     return min(seen - 1, int(0.9 * seen))
 
@@ -140,7 +140,7 @@ def _is_calm(
     state: Record, seen: Seen, row: int, delays_s: Array, seen_ticks: int, separable: bool, largest_s: float,
     margins_s: Array, policy: Policy,
 ) -> bool:  # fmt: skip
-    """Whether a vehicle is heard, guided and at ease, with enough headroom: true at most ticks."""
+    """Whether a vehicle is heard, guided and settled, with enough headroom: true at most ticks."""
     if seen.silent[row] or not seen.guided[row] or not is_settled(state):
         return False
     margin_s, caution = margins_s[state.gain_set], policy.caution_headroom
@@ -214,12 +214,12 @@ class FormationMonitor:
         count = judge(self.watched, seen, self.policy, self.separable)
         changed: list[int] = self._changed[:count].tolist()
         first = self._next_to_release() if changed else -1
-        for row, before, after in zip(
+        for row, before, judged in zip(
             changed, _in_python(self._states[changed]), _in_python(self._after[changed]), strict=True
         ):
-            if after.released and not before.released and row != first:
-                after = after._replace(mode=Mode.CRITICAL, released=False)  # a vehicle behind it is released first
-                self._after[row] = after
+            after = judged
+            if after.released and not before.released and row != first:  # a vehicle behind it is released first
+                self._after[row] = after = after._replace(mode=Mode.CRITICAL, released=False)
             if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                 changes.append((row, before, after))
         self._states[:] = self._after
@@ -260,7 +260,7 @@ class FormationMonitor:
     def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it.
 
-        A CRITICAL vehicle whose headroom is unknown does not open it: its loop may be well, and its gains are slow.
+        A CRITICAL vehicle whose headroom is unknown does not open it: its loop may be stable, and its gains are slow.
         """
         if not self._troubled and self.opening == 1.0:
             return

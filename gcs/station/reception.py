@@ -52,8 +52,8 @@ REPORTED = np.dtype(
 _ORDER, _DELIVERY, _JUMP, _EXCHANGE, ANSWER = range(5)
 _NEWS = np.dtype([("kind", "i8"), ("row", "i8"), ("value_ns", "i8"), ("sent_ns", "i8")])
 """Work that a kernel leaves to Python. _ORDER: report a frame order (value_ns); _DELIVERY: pass to the loop the one-way
-delay (value_ns) of a message sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request value_ns; ANSWER: answer
-the request sent_ns that arrived at value_ns."""
+delay (value_ns) of a message sent at sent_ns; _JUMP: begin anew; _EXCHANGE: send the request with ts1 = value_ns;
+ANSWER: answer the request with ts1 = sent_ns that arrived at value_ns. One frame makes at most NEWS_OF_A_FRAME."""
 NEWS_OF_A_FRAME = 3
 
 
@@ -87,7 +87,7 @@ class Now(NamedTuple):
     """The zero of the stamps in set-points."""
     period_ns: int
     """Minimum time between two exchanges requested because of refused states."""
-    tells: bool
+    heeds_deliveries: bool
     """Whether the loop heeds deliveries."""
 
 
@@ -378,7 +378,7 @@ def _take_position(
     sample_ns = sampled_ns(clock, boot_ms, received_ns, link.newest)
     if link.left_out:
         tables.telemetry_ns[row] = received_ns
-        return  # on the ground, others may fly over it
+        return  # its states are not used: others may fly over it while it is on the ground
     if sample_ns == UNKNOWN:
         if not (clock.lost or clock.doubtful_state):
             tables.telemetry_ns[row] = received_ns  # heard, though before the first exchange
@@ -406,7 +406,7 @@ def _take_reply(tables: Tables, row: int, tc1_ns: int, ts1_ns: int, received_ns:
         if tables.fresh_counts[row] < len(tables.fresh_ns[row]):
             tables.fresh_ns[row, tables.fresh_counts[row]] = rtt_ns
             tables.fresh_counts[row] += 1
-        if now.tells:
+        if now.heeds_deliveries:
             key_ms = (ts1_ns - now.start_ns) // 1_000_000
             delivered_ns = delivery_ns(link, clock, key_ms, now.start_ns + key_ms * 1_000_000)
             _note(tables.news, tables.news_count, _DELIVERY, row, delivered_ns, ts1_ns)

@@ -60,7 +60,7 @@ class Station:
     """Flies one formation. `start_ns` is the time of the first control tick.
 
     `stopwatch_ns` is a clock that times the calls of the user's own control law; None in virtual time. `strangers`:
-    whether simulated vehicles must say that they are before they are commanded.
+    whether vehicles must say that they are simulated before they are commanded.
     """
 
     next_tick_ns = Cell[int]()
@@ -128,9 +128,9 @@ class Station:
         self._why_absent = [""] * n
         """Why each vehicle is absent, unless it is silent."""
         self._rows, self._to_check, self._busy = range(n), [*range(n)], set(range(n))
-        """`_to_check`: rows of vehicles that `_all_ready` has to check; `_busy`: those for which a command may be due."""
+        """`_to_check`: rows that `_all_ready` has to check; `_busy`: those for which a command may be due."""
         self._announcements: list[tuple[RemoteVehicle, Mode, str]] = []
-        """Changes that vehicles are not yet told."""
+        """Changes that are not announced yet."""
         self._absent, self._gone = [""] * n, dict[int, bool]()
         """Why each vehicle is absent, "" if it is not; and those absent, by row, with whether pilots fly them."""
         self._returning: dict[int, bool] = {}
