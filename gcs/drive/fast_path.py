@@ -36,7 +36,7 @@ _MOST_TICKS, _MOST_ROWS = 128, 1024
 _WIRE = np.dtype(
     [
         ("arrived", "i8"), ("arrived_bytes", "i8"),  # datagrams not yet passed on to Python
-        ("in_step", "i8"), ("taken", "i8"),  # arrivals of the last step, and how many of them the station took in
+        ("in_step", "i8"), ("taken", "i8"),  # arrivals of the last step, and how many of them the station processed
         ("sent", "i8"), ("sent_bytes", "i8"),  # datagrams that enter the links in the next step
         ("entered", "i8"), ("waiting", "i8"), ("leaving", "i8"),  # the results of `step_all`
         ("now_ns", "i8"), ("next_ns", "i8"),  # time of the last step, and when the next is due
@@ -75,7 +75,7 @@ class Ends(NamedTuple):
 
 
 class Stopped(NamedTuple):
-    """A step that Python must finish: its time, the datagrams that arrived, and how many of these are taken in."""
+    """A step that Python must finish: its time, the datagrams that arrived, and how many of these are processed."""
 
     now_ns: int
     arrived: Datagrams | list[Datagram]

@@ -94,7 +94,7 @@ def fly(
                 raise
             finally:
                 unwritten = writer.close()
-            if unwritten:  # among these is the "end" event, for which the observer would wait
+            if unwritten:  # the "end" event is among them, and the observer would wait for it
                 observer.terminate()
         return finish(folder, unwritten=unwritten)
 
@@ -177,7 +177,7 @@ def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generato
     command = [sys.executable, "-m", "gcs.views.observer", str(folder), "--parent", str(os.getpid())]
     command += [] if show_table else ["--no-table"]
     command += [] if viewer is None else ["--viewer", viewer]
-    with held_back():  # the observer ignores Ctrl-C itself once it has started
+    with held_back():  # once it has started, the observer itself ignores Ctrl-C
         process = subprocess.Popen(command, stdin=subprocess.PIPE)
     try:
         yield process

@@ -39,7 +39,7 @@ class Guard:
     ) -> list[Datagram]:
         """The datagrams reduced to their verified frames; refused frames are counted by reason.
 
-        `is_another` says whether a datagram claims a known system id from another address, see `Station`.
+        `is_another` says whether a datagram claims a known system id from another address, see `Reception`.
         """
         verified: list[Datagram] = []
         for datagram in datagrams:

@@ -25,7 +25,7 @@ _USED_MESSAGES = (
 )
 """Messages whose rates the other station may not change: the flight uses them."""
 _DATAGRAMS_A_STEP = 64
-"""Most datagrams read from the other station per step. Others wait; the kernel drops what exceeds its buffer."""
+"""Most datagrams read from the other station per step. The others wait in the socket buffer, which drops any excess."""
 
 
 class Mirror:

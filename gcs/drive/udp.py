@@ -34,8 +34,8 @@ _TOGETHER_NS = 8_000_000
 _BEFORE_TICK_NS = 2_000_000
 """How long before a tick the sockets are read. In the time left, 250 vehicles send 30 datagrams."""
 _FEW = 25
-"""So many vehicles need so little work before a tick that requests can be sent then. In a channel with limited
-bandwidth, requests would delay the set-points: they are sent between ticks."""
+"""Up to this many vehicles need so little work before a tick that requests can be sent then. In a channel with limited
+bandwidth, requests would delay the set-points, so they are sent between ticks."""
 _PORTS_TO_TRY, _LAST_PORT = 100, 65535
 
 
@@ -215,11 +215,11 @@ def drive(
 def _step(
     station: Station, link: StationSocket, writer: RunWriter, fast: UdpFastPath | None, mirror: Mirror | None
 ) -> TickArray | None:
-    """Do a step in Python, or what the fast path has left of it; returns the rows of the tick if there was one."""
+    """Do a step in Python, or finish one that the fast path began; returns the rows of the tick if there was one."""
     if fast is None:
         now_ns = clock_ns()
         if len(station.vehicles) > _FEW and station.next_event_ns <= now_ns < station.next_tick_ns:
-            _send(station, link, station.step([], now_ns)[0])  # before many datagrams are read, to send them in time
+            _send(station, link, station.step([], now_ns)[0])  # requests leave in time, before many datagrams are read
         datagrams = link.receive(station.counters, station.is_another)
     else:
         datagrams = link.arrivals(fast.read)

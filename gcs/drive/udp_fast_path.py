@@ -86,7 +86,7 @@ class Ends(NamedTuple):
     entries: Bytes
     """New entries of each network's telemetry log, (networks, bytes)."""
     logged: Ints
-    """The size of these."""
+    """The size of the entries of each network."""
 
 
 class UdpFastPath:
@@ -123,12 +123,12 @@ class UdpFastPath:
         return outcome not in (NOT_TAKEN, NOT_DONE)
 
     def look_again(self) -> None:
-        """To be called after Python has changed the station."""
+        """Take up the station's data again: call this after Python has changed the station."""
         self._handle = None
 
     @property
     def read(self) -> Batch:
-        """What the last step has read."""
+        """The datagrams that the last step has read."""
         state = self._state
         return batch(self._ends.wire.buffers, *(state[name][0] for name in ("count", "end", "errors", "read_ns")))
 
@@ -167,7 +167,7 @@ def _step(ends: Any) -> int:
     if outcome == WITH_TICK:
         last_ns = second_ns[-1] if len(second_ns) else schedule.now_ns
         for row in range(len(own.sent_ns)):
-            own.sent_ns[row] = last_ns  # also for vehicles that are sent none
+            own.sent_ns[row] = last_ns  # kept for vehicles that are sent none
         for k in range(len(second_ns)):
             own.sent_ns[second.rows[k]] = second_ns[k]
         if not fast_rows(own.data, own.sent_ns, own.rows):
