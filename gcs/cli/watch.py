@@ -140,12 +140,12 @@ def replay(
     skipped and counted.
     """
     given, _ = _given(margin, design)
-    from gcs.watch.rebuild_report import found, rebuild_report
+    from gcs.watch.rebuild_report import find_log, rebuild_report
     from gcs.watch.tlog import read_tlog
 
     if save_links is not None:
         options.out_file("--save-links", save_links)
-    there = found(run)
+    there = find_log(run)
     log = read_tlog(there.log_file)
     if scenario_file is not None:
         scenario = _formation(scenario_file, given)

@@ -78,7 +78,7 @@ def _of_log(file: Path) -> Iterator[Message]:
 
 
 def _known(fields: dict[str, Any]) -> dict[str, Any]:
-    """The fields without those that are None, NaN or infinite, which JSON cannot represent."""
+    """The fields except those that are None, NaN or infinite: JSON cannot represent the last two."""
     return {name: value for name, value in fields.items() if plain(value) is not None}
 
 

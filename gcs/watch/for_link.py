@@ -1,6 +1,6 @@
 """Chooses gains for measured links: finds the loop delay and its spread, and the best gains for these.
 
-The measured one-way delays and losses of each vehicle are resampled at the rates of the scenario. Two designs are
+The measured one-way delays and losses of each vehicle are resampled at the scenario's rates. Two designs are
 compared: gains without prediction, at the worst loop delay, and gains with prediction over the median delay, at the
 worse of the least and the worst delay. Either must keep the wanted headroom.
 """
@@ -26,7 +26,7 @@ from gcs.plan.design import GainsAtDelay, LinkPart
 from gcs.plan.expected_delay import drawn_loop_delays_s
 from gcs.plan.flight_plan import given_response, loop_timing
 from gcs.plan.given import with_given
-from gcs.watch.rebuild_report import found
+from gcs.watch.rebuild_report import find_log
 from gcs.watch.saved_links import LinkRecorder, recorded
 from gcs.watch.tlog import read_tlog
 from scenarios.keys.part import PREDICTION_MAX_S
@@ -70,7 +70,7 @@ def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario,
 
     Raises InputError if the log shows too little, or no gains tolerate the delays.
     """
-    log_file = found(run_or_file).log_file
+    log_file = find_log(run_or_file).log_file
     recorder = recorded(read_tlog(log_file).frames)
     if not recorder.measured:  # this raises the error that says what is missing
         recorder.profile(str(log_file), option=f"{OPTION}: {log_file}")

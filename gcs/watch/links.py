@@ -8,7 +8,7 @@ which makes them lower bounds.
 
 A *look* samples how old the newest states are, as a station would at a control tick. Repetition of a state because
 telemetry is slower than control is not counted as loop delay (`gcs.control.loop_delay.repeated_s`). Until a station
-asks, vehicles send states at their own rate; repetition because it is below the scenario's is not counted either.
+asks, vehicles send states at their own rate; repetition because it is below the scenario's rate is not counted either.
 Without the scenario no rates are known, and all repetition counts. With loops on board, the delays are those of a
 vehicle's own states, not of the oldest state that its command needs.
 """
@@ -77,7 +77,7 @@ class LinkFigures(Published):
     effective_headroom: float | None
     """1 - effective loop delay / margin."""
     unjudged: bool
-    """Whether there is a margin, but the loop delay was unknown or a lower bound for most of the last quarter."""
+    """Whether there is a margin, but the loop delay was unknown or a lower bound in most of the last quarter."""
     received: int
     lost: int
     late: int
@@ -114,7 +114,7 @@ class WatchedVehicle:
 
     def __init__(self, system_id: int, rates: Rates | None = None) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
-        self.remote.goal = None  # it is not to be brought into any state
+        self.remote.goal = None  # it is commanded nothing
         self.rtt_s = array("d")
         self._exchanged_ns = 0, 0
         """When the first and the newest reply came."""
@@ -164,7 +164,7 @@ class WatchedVehicle:
         self._least_ns = min(self._least_ns[0], received_ns - boot_ns), self._least_ns[1]
 
     def _has_gap(self, now_ns: int) -> bool:
-        """Whether no state came for so long that it was not sent, or is lost. Some vehicles send one every 2 s."""
+        """Whether the newest state is so old that the next was lost or not sent. Some vehicles send one every 2 s."""
         usual_ns = self._interval_ns if self.states > 1 else 0
         return self.states > 0 and now_ns - self.state_ns > max(_GAP_NS, 2 * usual_ns)
 
@@ -178,8 +178,8 @@ class WatchedVehicle:
         self.rtt_s.append(rtt_ns * 1e-9)
         self._exchanged_ns = self._exchanged_ns[0] or received_ns, received_ns
 
-    def exchanges(self, now_ns: int) -> bool:
-        """Whether replies come: there was one in the time of the usual `UNANSWERED` of them."""
+    def answers(self, now_ns: int) -> bool:
+        """Whether it still answers requests: its newest reply is no older than `UNANSWERED` replies usually take."""
         (first_ns, newest_ns), count = self._exchanged_ns, len(self.rtt_s)
         usual_ns = UNANSWERED * (newest_ns - first_ns) // max(1, count - 1)
         return count > 0 and now_ns - newest_ns <= max(UNANSWERED_NS, usual_ns) + 3 * (self.remote.clock.rtt_ns or 0)
@@ -198,9 +198,9 @@ class WatchedVehicle:
             sampled_ns = self.boot_ns + self.least_delay_ns
             if clock.samples:
                 sampled_ns = to_station_ns(clock.estimate, self.boot_ns)
-                down_s = clock.down_ns * 1e-9 if clock.down_ns is not None and self.exchanges(now_ns) else nan
+                down_s = clock.down_ns * 1e-9 if clock.down_ns is not None and self.answers(now_ns) else nan
             age_s = (now_ns - sampled_ns) * 1e-9
-            if clock.samples and clock.exchange_due:  # the state is of a clock that may have started anew
+            if clock.samples and clock.exchange_due:  # the vehicle's clock may have restarted
                 age_s = down_s = nan
         self.age_s.append(age_s)
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s, repeated_s))
@@ -258,7 +258,7 @@ class WatchedVehicle:
             return "silent"
         if left is not None and left < 0:
             return PAST
-        if not self.remote.clock.samples or not self.exchanges(now_ns):
+        if not self.remote.clock.samples or not self.answers(now_ns):
             return "no exchange"
         return "no position" if loop_delay_s is None else "measured"
 
@@ -285,14 +285,14 @@ class Watch:
         return now_ns
 
     def sent(self, datagrams: Iterable[Datagram]) -> None:
-        """Note the exact times at which our own requests among these datagrams were sent."""
+        """Record the exact send times of our own requests among these datagrams."""
         for data, _, sent_ns, _ in datagrams:
             for frame in mavlink.decode(data, Counter()):
                 if frame.msg_id == mavlink.TIMESYNC:
                     self._asked[frame.fields[1]] = sent_ns
 
     def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
-        """Take in a frame of a vehicle or a station; returns the vehicle, or None if it tells nothing new of one."""
+        """Take in a frame of a vehicle or a station; returns the vehicle, or None if the frame has no news of one."""
         vehicle = self._vehicle(frame)
         if vehicle is None:
             if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
@@ -377,7 +377,7 @@ def prepare() -> None:
 
 
 class Requests:
-    """Sends TIMESYNC requests in turn to each address that vehicles send from; all vehicles behind it answer.
+    """Makes TIMESYNC requests to each address that vehicles send from, in turn; all vehicles behind it answer.
 
     `timesync_hz` is the rate to each address; 0 sends none. With a `position_hz`, each vehicle that sends no position
     is asked for LOCAL_POSITION_NED at that rate, every `ASK_AGAIN_NS` until it complies.

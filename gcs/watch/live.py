@@ -40,7 +40,7 @@ def watch_links(
     shown: bool,
     recorder: LinkRecorder | None = None,
 ) -> WatchReport:
-    """Watch for a number of seconds or until there is a reason to stop; returns the figures over the whole time.
+    """Watch the links for a number of seconds, or until there is a reason to stop; returns the figures over that time.
 
     `margin_of` says where the margins of `design` come from. `timesync_hz` is the rate of TIMESYNC requests to each
     address, 0 for none. Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder`

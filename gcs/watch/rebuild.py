@@ -307,12 +307,12 @@ class _Rebuilding:
         self._rows.append(rows)
 
     def _judge_silence(self, now_ns: int) -> None:
-        """Note which vehicles no longer answer TIMESYNC. A request in the log does not say for whom it is.
+        """Note which vehicles no longer answer TIMESYNC. A request in the log does not say which vehicle it is for.
 
-        So the time since the newest reply decides, not the number of requests. A vehicle that says nothing is silent.
+        So the time since the newest reply decides, not the number of requests. A vehicle that sends nothing is silent.
         """
         for vehicle, heard_ns in zip(self._vehicles, self._telemetry_ns, strict=True):
-            if vehicle.rtt_s and not vehicle.exchanges(now_ns) and now_ns - heard_ns <= SILENCE_S * NS_PER_S:
+            if vehicle.rtt_s and not vehicle.answers(now_ns) and now_ns - heard_ns <= SILENCE_S * NS_PER_S:
                 vehicle.remote.clock.unanswered = UNANSWERED  # until the next reply
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:

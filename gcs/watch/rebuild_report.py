@@ -41,7 +41,7 @@ class LogSource:
     """The summary of the run that wrote the log."""
 
 
-def found(run_or_file: Path) -> LogSource:
+def find_log(run_or_file: Path) -> LogSource:
     """A log, with the files beside it if it is a run's only log.
 
     Raises InputError for the folder of a run in several networks, which has a log for each.

@@ -3,7 +3,7 @@
 Up delays are those of position reports and TIMESYNC replies, from the vehicle's time stamps. Down delays are those of
 TIMESYNC requests; each stands for all datagrams until the next exchange. Both depend on the estimated offset of the
 vehicle's clock, which exchanges show only to within half a round trip. Its error adds to one direction what it takes
-from the other, so their sum is right. The least delays come out equal both ways, unless the clock's bound forbids it.
+from the other, so their sum is right. The least delays are equal both ways, unless the bounds of the clock exclude it.
 
 Losses up are counted from sequence numbers. Losses down cannot be observed here and are assumed to be the same.
 """
@@ -46,7 +46,7 @@ class _OneVehicle:
 class LinkRecorder:
     """Keeps each vehicle's delays and losses from the frames that a `Watch` has taken in.
 
-    Cameras and gimbals share the id of a vehicle but number their frames apart.
+    These are the autopilots' frames: cameras and gimbals share a vehicle's id but number their frames separately.
     """
 
     def __init__(self, watch: Watch) -> None:

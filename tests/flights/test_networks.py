@@ -17,7 +17,7 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.record import tlog_file
 from gcs.station.station import Station
 from gcs.studies.benchmark import with_vehicles, without_solver
-from gcs.watch.rebuild_report import found
+from gcs.watch.rebuild_report import find_log
 from gcs.watch.tlog import read_tlog
 from scenarios.files import dump, load, parse
 from scenarios.networks import ids_of, networks_of
@@ -66,8 +66,8 @@ def test_vehicles_of_the_same_id_fly_in_their_own_networks(real_time: bool, tmp_
     logs = {network: senders(tmp_path / "run", network) - {255} for network in networks_of(IDS.values())}
     assert logs == {0: {1, 2}, 1: {1, 2}, 9: {2}}
     with pytest.raises(InputError, match=r"a telemetry log for each network \(flight-1\.tlog, flight-9\.tlog\)"):
-        found(tmp_path / "run")
-    of_one = found(tmp_path / "run" / tlog_file(0))
+        find_log(tmp_path / "run")
+    of_one = find_log(tmp_path / "run" / tlog_file(0))
     assert of_one.scenario is None  # or the vehicles of other networks would count as lost
 
 

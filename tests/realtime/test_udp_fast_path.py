@@ -13,7 +13,7 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE, TLOG_FILE
 from gcs.station.station import Station
-from gcs.watch.rebuild_report import found, rebuild_report
+from gcs.watch.rebuild_report import find_log, rebuild_report
 from gcs.watch.tlog import read_tlog
 from scenarios.files import load
 from tests.support.known import known
@@ -47,7 +47,7 @@ def test_the_log_of_a_flight_tells_what_its_ticks_tell(
     _, plan = flight_plan(load(SCENARIOS / "triangle5.toml").model_copy(update={"duration_s": SECONDS}))
     fly_real_time(plan, margins_of(plan), tmp_path)
     log = read_tlog(tmp_path / TLOG_FILE)
-    flown, rebuilt = read_summary(tmp_path / SUMMARY_FILE), rebuild_report(log, found(tmp_path)).flight
+    flown, rebuilt = read_summary(tmp_path / SUMMARY_FILE), rebuild_report(log, find_log(tmp_path)).flight
     assert rebuilt is not None
     assert (rebuilt.verdict, rebuilt.reason) == (flown.verdict, flown.reason)
     assert flown.control is not None
