@@ -22,8 +22,8 @@ from scenarios.schema import NS_PER_S
 
 _UNANNOUNCED_S = 3.0
 _LEAD_S = 0.5
-"""The velocity target leads the vehicle's newest velocity by at most the gain in velocity at its largest acceleration
-over the sum of this time, the age of that velocity and the delay down. More would wind up while it cannot follow."""
+"""The velocity target leads the vehicle's newest velocity by at most the velocity gained at its largest acceleration in
+this time plus the age of that velocity plus the delay down. More would wind up while the vehicle cannot follow."""
 _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: an origin that moves by less is considered unchanged."""
 
@@ -84,7 +84,7 @@ class AutopilotFleet(Fleet):
         return ""
 
     def _leave_out(self, vehicles: list[RemoteVehicle], history: StateHistory) -> None:
-        """Fly without some vehicles. From now on they get no commands until the flight ends."""
+        """Fly without some vehicles, which get no commands until the flight ends."""
         for vehicle in vehicles:
             vehicle.left_out, vehicle.goal = True, None
             history.forget(self.vehicles.index(vehicle))
@@ -120,7 +120,7 @@ class AutopilotFleet(Fleet):
             return
         self._frames = frames if all(startup.origin for startup in self.starts) else []
         for row, startup in enumerate(self.starts):
-            if startup.origin is None and row in self._located:  # it has restarted
+            if startup.origin is None and row in self._located:  # the vehicle has restarted
                 history.forget(row)
             if first.origin is None or startup.origin is None:
                 continue
@@ -194,7 +194,7 @@ class AutopilotFleet(Fleet):
             self._rest(row)
             return None
         if not vehicle.guided:
-            self._rest(row)  # set-points only show it that a station is there; each starts from its own velocity
+            self._rest(row)  # set-points only show that a station is there; each starts from the vehicle's velocity
         self.loop.remember(row, due_ns, command)
         late_s = (due_ns - sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if sample_ns else 0.0
         lead_m_s = self._bounds.acceleration_m_s2(row) * (late_s + _LEAD_S)

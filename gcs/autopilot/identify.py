@@ -7,7 +7,7 @@ would measure that limit instead of the response. A sine reversed half-way would
 
 The manoeuvre is flown at the formation's velocity, because air resistance matters. At 1.9 rad/s, an ArduCopter in SITL
 responds with a gain of 1.09 at rest; at 4 m/s the gain is 0.98 along track and 1.02 across track. Five of them became
-unstable at 506 ms of loop delay at rest, and at about 565 ms at 4 m/s. Across track, the margin is the smaller one.
+unstable at 506 ms of loop delay at rest, and at about 565 ms at 4 m/s. The margin across track is the smaller one.
 
 The models of `gains.performance.response` are fitted to the velocity that a vehicle reports; the Bayesian information
 criterion selects one. A command is taken to act at its send time plus the measured delay down, and samples are timed by

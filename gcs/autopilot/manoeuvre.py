@@ -14,7 +14,7 @@ from gcs.plan.flight_plan import FlightPlan, Responses, margin_steps
 from scenarios.schema import NS_PER_S
 
 _UNNOTICED_NS = NS_PER_S
-"""A clock jump is detected within this time: samples this recent have wrong instants."""
+"""A clock jump is detected within this time: samples this recent may have wrong instants."""
 
 
 class _Sample(NamedTuple):
@@ -57,7 +57,7 @@ class Identification:
         self._steps = self._result()
 
     def command(self, due_ns: int) -> tuple[float, float]:
-        """The acceleration commanded to all vehicles at a tick; it is recorded."""
+        """The acceleration commanded to all vehicles at a tick; the manoeuvre's part is recorded."""
         if self._run_up is None:
             return 0.0, 0.0
         began_ns, run_up = self._run_up
@@ -75,7 +75,7 @@ class Identification:
         return command * north, command * east
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
-        """The plan with the margins of the identified responses, or why there is none; None while still at work."""
+        """The plan with the margins of the identified responses, or why there is none; None until either is known."""
         gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.stays_disarmed), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"

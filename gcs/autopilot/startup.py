@@ -29,7 +29,7 @@ EKF_STATUS_REPORT and ESTIMATOR_STATUS."""
 _STANDBY = 3
 """MAV_STATE of a vehicle on the ground; ArduCopter reports it there even while armed."""
 _OLD_MS = 1000
-"""Age beyond which a reported altitude is extended with the height in the local frame."""
+"""Age beyond which a reported altitude is updated from the height in the local frame."""
 _HAS_FLOWN_M, _FLIES_M = 1.0, 2.0
 """An armed vehicle above the first altitude has flown. One that has landed flies again above the second, which leaves
 more room for barometer drift."""
@@ -42,7 +42,7 @@ class AutopilotStartup(Startup):
     """Start-up of one vehicle, which takes off to `altitude_m`.
 
     A vehicle that has been in the air and is back on the ground, or that somebody has disarmed, is never armed again:
-    people may be near it. Its pilot may arm it, and must take off a vehicle that has landed.
+    people may be near it. Its pilot may arm it again and, if it has landed, must also fly the take-off.
     """
 
     def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
@@ -57,7 +57,7 @@ class AutopilotStartup(Startup):
         self._armed = self._standby = self._has_flown = self._restarted = False
         self._text = ""
         """The last text received; cleared by armed heartbeats."""
-        self._origin_said = False
+        self._origin_reported = False
         self._sea_level_m = 0.0
         self._flags: int | None = None
         self._local: tuple[int, float, float, float, float, float] | None = None
@@ -93,7 +93,7 @@ class AutopilotStartup(Startup):
                 self.limits.take(fields)
             case mavlink.LOCAL_POSITION_NED:
                 self._local = fields[:6]
-                self._carry_altitude_on()
+                self._update_altitude()
             case mavlink.GLOBAL_POSITION_INT:
                 self._global(fields)
             case mavlink.EKF_STATUS_REPORT:
@@ -101,9 +101,9 @@ class AutopilotStartup(Startup):
             case mavlink.ESTIMATOR_STATUS:
                 self._flags = fields[9]
             case mavlink.GPS_GLOBAL_ORIGIN:
-                self.origin, self._origin_said = (fields[0] * 1e-7, fields[1] * 1e-7), True
+                self.origin, self._origin_reported = (fields[0] * 1e-7, fields[1] * 1e-7), True
                 self.origin_altitude_m = fields[2] * 1e-3
-            case mavlink.HOME_POSITION if not (self._origin_said or self.airborne) and isfinite(sum(fields[3:6])):
+            case mavlink.HOME_POSITION if not (self._origin_reported or self.airborne) and isfinite(sum(fields[3:6])):
                 self.origin = shifted((fields[0] * 1e-7, fields[1] * 1e-7), -fields[3], -fields[4])
                 self.origin_altitude_m = fields[2] * 1e-3 + fields[5]
             case _:
@@ -119,9 +119,9 @@ class AutopilotStartup(Startup):
         self._judge_ground()
 
     def _forget_old_frame(self) -> None:
-        """Forget the origin of the local frame if the vehicle has restarted; while it is armed its clock has jumped."""
+        """Forget the origin of the local frame after a restart; of an armed vehicle, only the clock has jumped."""
         if self._restarted and not self._armed:
-            self.origin, self._origin_said = None, False
+            self.origin, self._origin_reported = None, False
 
     def _judge_ground(self) -> None:
         """Decide from the newest heartbeat and altitude whether the vehicle has taken off or landed."""
@@ -132,8 +132,8 @@ class AutopilotStartup(Startup):
         elif self._armed and (above_home_m > _FLIES_M or not self._has_flown):
             self.stays_disarmed = ""
 
-    def _carry_altitude_on(self) -> None:
-        """Follow the height of the local frame while no altitude is reported: a climb towards an old one has no end."""
+    def _update_altitude(self) -> None:
+        """Update an old altitude from the local frame: with one that stays the same, a climb would never end."""
         if self._local is not None and self._reported is not None and self._local[0] - self._reported[0] > _OLD_MS:
             self.relative_altitude_m = self._reported[1] - self._local[3]
             self._judge_ground()
@@ -147,7 +147,7 @@ class AutopilotStartup(Startup):
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None:
             self._reported = boot_ms, relative_mm * 1e-3 + self._local[3]
-        if self._local is not None and not self._origin_said and not self.airborne:
+        if self._local is not None and not self._origin_reported and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
             since_s = (boot_ms - local_ms) * 1e-3
             place = latitude * 1e-7, longitude * 1e-7

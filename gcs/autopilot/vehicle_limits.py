@@ -32,10 +32,10 @@ _ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
 
 
 class ReportedLimits:
-    """The limits that one vehicle reports."""
+    """Reads the limits of one vehicle from its parameters."""
 
     def __init__(self) -> None:
-        self._told: list[float | None] = [None] * 3
+        self._reported: list[float | None] = [None] * 3
         """Acceleration, jerk and set-point timeout; None while not reported."""
         self._kind = ""
         self._asked: dict[str, int] = {}
@@ -46,7 +46,7 @@ class ReportedLimits:
         if now_ns < self._not_before_ns or kind.name not in _PARAMETERS:
             return None
         self._kind = kind.name
-        for (name, _), known in zip(_PARAMETERS[kind.name], self._told, strict=True):
+        for (name, _), known in zip(_PARAMETERS[kind.name], self._reported, strict=True):
             if known is None and self._asked.get(name, 0) < _ATTEMPTS:
                 self._asked[name] = self._asked.get(name, 0) + 1
                 self._not_before_ns = now_ns + max(_PATIENCE_NS, 3 * rtt_ns)
@@ -62,28 +62,28 @@ class ReportedLimits:
         at = [known for known, _ in _PARAMETERS[self._kind]].index(name)
         limit = value * _PARAMETERS[self._kind][at][1]
         if _LEAST <= limit <= _LARGEST:
-            self._not_before_ns, self._told[at] = 0, round(limit, 6)
+            self._not_before_ns, self._reported[at] = 0, round(limit, 6)
 
     @property
     def acceleration_bound_m_s2(self) -> float:
-        told = self._told[0]
-        return ACCELERATION_M_S2 if told is None else _ACCELERATION_SHARE * told
+        reported = self._reported[0]
+        return ACCELERATION_M_S2 if reported is None else _ACCELERATION_SHARE * reported
 
     @property
     def jerk_bound_m_s3(self) -> float:
         """The largest rate of change of the acceleration."""
-        told = self._told[1]
-        return JERK_M_S3 if told is None else _JERK_SHARE * told
+        reported = self._reported[1]
+        return JERK_M_S3 if reported is None else _JERK_SHARE * reported
 
     def in_words(self) -> str:
-        told = [
+        reported = [
             f"{name} {value:g} {unit}"
             for (name, _), value, unit in zip(
-                _PARAMETERS.get(self._kind, ()), self._told, ("m/s^2", "m/s^3", "s"), strict=False
+                _PARAMETERS.get(self._kind, ()), self._reported, ("m/s^2", "m/s^3", "s"), strict=False
             )
             if value is not None
         ]
-        source = ", ".join(told) if told else "it tells no limits"
+        source = ", ".join(reported) if reported else "it reports no limits"
         return f"set-points within {self.acceleration_bound_m_s2:g} m/s^2 and {self.jerk_bound_m_s3:g} m/s^3: {source}"
 
 
@@ -109,7 +109,7 @@ class Bounds:
         self._last[row], self._approaches[row] = (0.0, 0.0), True
 
     def bound(self, controls: Records, blends: Records) -> None:
-        """Keep the commands on the braking curve and within the limits of acceleration and jerk."""
+        """Keep commands within the limits of acceleration and jerk, and approaching vehicles on the braking curve."""
         flown = blends["flown"].tolist()
         commands = controls["command_m_s2"].tolist()
         for row, spacing_error in enumerate(controls["spacing_error_m"].tolist()):

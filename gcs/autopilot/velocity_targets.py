@@ -36,7 +36,7 @@ class VelocityTargets:
         return self._with_climb(row, (0.0, 0.0), (0.0, 0.0))
 
     def rest(self, row: int) -> None:
-        """Note that no set-point is sent: the next one starts from the vehicle's velocity."""
+        """Record that no set-point is sent: the next one starts from the vehicle's velocity."""
         self._targets[row] = None
 
     def steers(self, row: int) -> bool:

@@ -37,7 +37,7 @@ def test_a_vehicle_that_tells_nothing_is_asked_nine_times() -> None:
     limits, asked = answered(ARDUCOPTER, {b"WPNAV_ACCEL": float("nan"), b"PSC_JERK_XY": -1.0})
     assert len(asked) == 9
     assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3) == (2.0, 4.0)
-    assert limits.in_words().endswith("it tells no limits")
+    assert limits.in_words().endswith("it reports no limits")
 
 
 def test_what_no_vehicle_can_mean_is_no_limit() -> None:
@@ -50,4 +50,4 @@ def test_what_was_not_asked_is_not_believed() -> None:
     limits = ReportedLimits()
     limits.take((10.0, 3, 0, b"WPNAV_ACCEL\0", 9))
     assert limits.next(UNRECOGNISED, 0, target_system=1, rtt_ns=0) is None
-    assert limits.in_words().endswith("it tells no limits")
+    assert limits.in_words().endswith("it reports no limits")
