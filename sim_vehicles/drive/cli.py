@@ -109,20 +109,20 @@ def _fly(
     prepare(scenario)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, recorder=log, signed=signed)
-    say = _Lines(start_ns)
+    lines = _Lines(start_ns)
     how = ", signed" if signed else ""
     if not signed:
-        say.openness([options.station], "others may send from there and nothing is signed; see --key")
-    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
-    stop = _stop_rule(signals, start_ns, options, say, fleet)
+        lines.warn_if_open([options.station], "others may send from there and nothing is signed; see --key")
+    lines.print(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
+    stop = _stop_rule(signals, start_ns, options, lines, fleet)
 
     def look(now_ns: int) -> bool:
-        say.news(fleet.take_changes(), ports.sockets, log)
+        lines.news(fleet.take_changes(), ports.sockets, log)
         return stop(now_ns, fleet.commanded_ns)
 
     if not stop(start_ns, start_ns):
         run(ports.sockets, lambda now: ports.send(fleet.step(ports.receive(), now)), lambda: fleet.next_event_ns, look)
-    say.summary(fleet.counters + ports.sockets.counters, log, options.counters)
+    lines.summary(fleet.counters + ports.sockets.counters, log, options.counters)
 
 
 def _links_only(
@@ -149,22 +149,22 @@ def _links_only(
     opened.callback(peers.sockets.close)
     start_ns = time.monotonic_ns()
     links = Relay(scenario, start_ns, recorder=log)
-    say = _Lines(start_ns)
+    lines = _Lines(start_ns)
     ports = ", ".join(map(_shown, options.vehicle_port))
-    say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
-    say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
-    stop = _stop_rule(signals, start_ns, options, say)
+    lines.warn_if_open(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
+    lines.print(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
+    stop = _stop_rule(signals, start_ns, options, lines)
 
     def look(now_ns: int) -> bool:
-        say.news(peers.take_changes(), peers.sockets, log)
+        lines.news(peers.take_changes(), peers.sockets, log)
         return stop(now_ns, links.last_heard_ns)
 
     run(peers.sockets, lambda now: peers.send(links.step(peers.receive(), now)), lambda: links.next_event_ns, look)
-    say.summary(links.counters + peers.sockets.counters, log, options.counters)
+    lines.summary(links.counters + peers.sockets.counters, log, options.counters)
 
 
 def _stop_rule(
-    signals: list[int], start_ns: int, options: argparse.Namespace, say: "_Lines", fleet: "Fleet | None" = None
+    signals: list[int], start_ns: int, options: argparse.Namespace, lines: "_Lines", fleet: "Fleet | None" = None
 ) -> Callable[[int, int], bool]:
     """The rule that ends the program, given the time now and the time of a station's last command."""
     duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
@@ -174,7 +174,7 @@ def _stop_rule(
         nonlocal alone_since_ns
         if alone_since_ns == math.inf and os.getppid() != options.parent:
             alone_since_ns = now_ns
-            say.line("the process that started this one has ended")
+            lines.print("the process that started this one has ended")
             if commanded_ns == start_ns:
                 return True  # nobody has flown them, so nobody will take them over
             if fleet is not None:
@@ -192,28 +192,28 @@ class _Lines:
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
-        self._read = True
+        self._is_read = True
         self._late = 0
         self._late_line_ns = start_ns
 
-    def line(self, text: str) -> None:
-        if self._read:
+    def print(self, text: str) -> None:
+        if self._is_read:
             try:
                 print(text, flush=True)
             except OSError:  # terminal or pipe was closed; the vehicles fly on
-                self._read = False
+                self._is_read = False
 
-    def openness(self, addresses: list[tuple[str, int]], why: str) -> None:
+    def warn_if_open(self, addresses: list[tuple[str, int]], why: str) -> None:
         """Warn of each address that other machines can reach."""
         for host, port in addresses:
             if not ip_address(host).is_loopback:
-                self.line(f"warning: {host}:{port} is open: {why}")
+                self.print(f"warning: {host}:{port} is open: {why}")
 
     def news(self, changes: list["Change"], sockets: "Sockets", log: "TruthLog | None") -> None:
         """Print what has happened since the last call, and write out the truth log."""
         for change in changes:
             time_s = (change.time_ns - self._start_ns) / NS_PER_S
-            self.line(f"{time_s:8.3f} s  vehicle {change.system_id}: {change.text}")
+            self.print(f"{time_s:8.3f} s  vehicle {change.system_id}: {change.text}")
         self.lateness(sockets)
         if log:
             log.flush()
@@ -223,17 +223,17 @@ class _Lines:
         late, now_ns = sockets.counters["left_late"], time.monotonic_ns()
         if late > self._late and now_ns - self._late_line_ns >= NS_PER_S:
             since_s = (now_ns - self._late_line_ns) / NS_PER_S
-            self.line(
+            self.print(
                 f"{(now_ns - self._start_ns) / NS_PER_S:8.3f} s  this host cannot keep up: {late - self._late} "
                 f"datagrams left more than 5 ms late in {since_s:.1f} s, the latest {sockets.latest_ns / 1e6:.1f} ms"
             )
             self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0
 
     def summary(self, counters: Counter[str], log: "TruthLog | None", kept: Path | None) -> None:
-        """Print the last line, the counters, and keep them in a file as JSON."""
+        """Print the counters as the last line, and write them to the file `kept` as JSON."""
         counters += Counter(truth_lost=log.lost if log else 0)
         counts = ", ".join(f"{name} {count}" for name, count in sorted(counters.items()))
-        self.line(f"received: {counts or 'nothing'}")
+        self.print(f"received: {counts or 'nothing'}")
         if kept:
             with contextlib.suppress(OSError):  # all is over, and the counters have been printed
                 kept.write_text(json.dumps(counters))
@@ -241,7 +241,7 @@ class _Lines:
 
 @contextlib.contextmanager
 def _signals() -> Generator[list[int]]:
-    """While entered, collect the signals that end the program in a list; under nohup SIGHUP is not among them."""
+    """Collect the signals that end the program in a list, until the context is left; not SIGHUP under nohup."""
     caught: list[int] = []
     wanted = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:

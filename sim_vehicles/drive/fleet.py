@@ -208,7 +208,7 @@ class Fleet:
     def go_on(self, entering: Datagrams, entered: int, waiting: int, leaving: int, now_ns: int) -> int:
         """Continue a step begun by `step_all`, which returned the three numbers; returns how many datagrams have left.
 
-        They are in `arrays`. More may leave, see `all_left` and `left`.
+        These datagrams are in `arrays`. More may leave, see `all_left` and `left`.
         """
         while entered < len(entering):
             begin, end, row, time_ns = entering.table[:, entered].tolist()

@@ -1,4 +1,4 @@
-"""A `Relay` on real UDP: vehicles of other programs send to our ports; the station hears each from a port of its own.
+"""A `Relay` on real UDP: other programs' vehicles send to our ports; the station hears each from a port of its own.
 
 A vehicle's datagrams go through its up link to the station, from a socket of that vehicle's own. The station's answers
 to that socket go through the down link to the address from which the vehicle last sent.

@@ -74,7 +74,7 @@ def flips_of(probability: float, drawn: float) -> int:
 
 @kernel
 def flip(data: NDArray[np.uint8], size: int, flips: NDArray[np.float64], count: int) -> None:
-    """Flip bits at fractions of a datagram's length; a place named twice flips once."""
+    """Flip bits at fractions of a datagram's length; a bit drawn twice is flipped once."""
     for k in range(count if size else 0):
         place = int(flips[k] * size * 8)
         first = True

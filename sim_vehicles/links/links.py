@@ -39,9 +39,9 @@ Entry = tuple[int, int, int, bytes, int, int]
 
 
 class Channel:
-    """Limited bandwidth, of one link or shared by several: a drop-tail queue with one sender.
+    """Limited bandwidth, of one link or shared by several: a drop-tail queue before one transmitter.
 
-    Sends one datagram at a time, in order of arrival; at equal times, in order of the calls of `send`.
+    It sends one datagram at a time, in order of arrival; at equal times, in order of the calls of `send`.
     """
 
     def __init__(self, channel: link_keys.Channel) -> None:

@@ -59,7 +59,7 @@ class Attitude(NamedTuple):
 
 
 class Aircraft:
-    """The motion of one aircraft. A push moves the air around the aircraft, which is carried along."""
+    """The motion of one aircraft. A push moves the air, which carries the aircraft along."""
 
     def __init__(self, scenario: Scenario, own: Vehicle) -> None:
         """Raises ScenarioError if the package or the model is missing, or cannot fly level at the vehicle's speed."""

@@ -35,11 +35,11 @@ PLACE_GAIN_1_S = 0.3
 """Gain from remaining distance to speed in a flight to a place."""
 YAW_RATE_MAX_RAD_S = 1.5
 ALTITUDE, CLIMB, YAW = 6, 7, 8
-"""Where a vehicle's record has these numbers of its motion."""
+"""Indices of these in `motion` of a vehicle's record."""
 
 
 class Motion(NamedTuple):
-    """Position, velocity and acceleration; the altitude is above the initial ground."""
+    """Position, velocity and acceleration; the altitude is above the ground where the vehicle started."""
 
     place_m: complex
     velocity_m_s: complex = 0j
@@ -87,7 +87,7 @@ def _advance_remembering(
     motion: Motion, target: Target, limits: Limits, h: float, steps: int, aimed: complex, jerk: complex, line: Line,
     end: int,
 ) -> tuple[Motion, Target, complex, complex, int, int]:  # fmt: skip
-    """As `_advance`, of a response with internal state; `end` rows of `line` are in use, and later those returned."""
+    """As `_advance`, for a response with internal state. `end` rows of `line` are in use, afterwards those returned."""
     first, half = 0, 0.5 * h
     for _ in range(steps):  # the acceleration wanted in mid-step is held throughout the step
         target = _aimed(motion, target, limits)
@@ -163,7 +163,7 @@ def set_target(vehicle: Record, target: Target) -> None:
 
 @kernel
 def is_led(vehicle: Record) -> bool:
-    """Whether a copter's target is an altitude or a place: then it may be about to change its mode."""
+    """Whether a copter's target is an altitude or a place: reaching it may change the mode."""
     return not (math.isnan(vehicle.target[7]) and math.isnan(vehicle.target[10]))
 
 

@@ -70,7 +70,7 @@ def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
 
 @kernel
 def aimed_at(wanted_m_s2: complex, before_m_s2: complex, limits: Limits, h: float) -> complex:
-    """The wanted acceleration within the limits, after a step at whose start `before_m_s2` was aimed at."""
+    """The wanted acceleration, within the limits of acceleration and of jerk since `before_m_s2`, a step earlier."""
     aimed = wanted_m_s2
     over = length(aimed) / limits.acceleration_max_m_s2
     if over > 1.0:
@@ -102,7 +102,7 @@ def followed(a: complex, jerk: complex, to: complex, limits: Limits, h: float) -
 
 @kernel
 def shifted(line: Line, first: int, end: int, h: float) -> tuple[int, complex]:
-    """Take the oldest `h` seconds from a delay line, which is in these rows: its new first row, and their mean."""
+    """Take the oldest `h` seconds from the delay line in these rows; returns its new first row, and the mean taken."""
     gained, left_s = 0j, h
     for row in range(first, end):
         duration_s = line[row, 0].real
@@ -117,5 +117,5 @@ def shifted(line: Line, first: int, end: int, h: float) -> tuple[int, complex]:
 
 @kernel
 def length(vector: complex) -> float:
-    """The length of a vector; that of `abs` depends on the C library."""
+    """The length of a vector; `abs` would depend on the C library."""
     return hypot(vector.real, vector.imag)

@@ -18,7 +18,7 @@ VEHICLE = np.dtype(
         ("system_id", "i8"), ("wire_id", "i8"),
         ("copter", "?"),  # else a double integrator
         ("plain", "?"),  # whether kernels may run its common events: `sim_vehicles.vehicles.plain`
-        ("pushed", "?"),  # whether kernels cannot move it: the craft then does, before each event that they run
+        ("pushed", "?"),  # whether kernels cannot move it: the craft moves itself before each event that they run
         ("version_1", "?"),  # whether it speaks MAVLink 1
         ("acts_ns", "i8"),  # when it next acts if nothing arrives
         ("sequence", "i8"),  # number of the next frame
@@ -37,7 +37,7 @@ VEHICLE = np.dtype(
         # the double integrator: its State at a time, its Command and its Bounds
         ("state_ns", "i8"), ("state", "f8", (4,)), ("command", "f8", (5,)), ("bounds", "f8", (4,)),
         ("altitude_m", "f8"),
-        # a copter: its Motion at that time, its Target and its Limits; and what makes its set-points and reports
+        # a copter: its Motion at that time, its Target and its Limits; and what its set-points and reports depend on
         ("motion", "f8", (9,)), ("target", "f8", (12,)), ("limits", "f8", (7,)),
         ("velocity_gain_1_s", "f8"), ("growth", "f8"),
         ("autopilot", "i8"), ("ready_ns", "i8"), ("origin_neu_m", "f8", (3,)),

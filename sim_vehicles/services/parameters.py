@@ -18,8 +18,8 @@ TIMEOUT_S = (0.1, 120.0)
 
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
 _PARAMETER_VALUE = struct.Struct("<4sHH16sB")
-"""PARAM_VALUE with the value as four raw bytes: those of an integer may look like a NaN, which a float may not
-preserve."""
+"""PARAM_VALUE with the value as four raw bytes: those of an integer may be a NaN's, which may change if handled as a
+float."""
 
 
 @dataclass(frozen=True)
@@ -161,4 +161,4 @@ ARDUPILOT_SETUP, PX4_SETUP = (
     [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
     for values in (_ARDUPILOT_VALUES, _PX4_VALUES)
 )
-"""Without effect. If they are missing, QGroundControl warns that frame, sensors, radio or battery are not set up."""
+"""Parameters without effect. Without them, QGroundControl warns that frame, sensors, radio or battery lack setup."""

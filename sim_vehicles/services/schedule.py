@@ -96,7 +96,7 @@ class Schedule:
             self.add_once(message_id, due_ns)
 
     def add_once(self, message_id: int, now_ns: int) -> None:
-        """Send a message once, at the next whole millisecond of boot time; now, if now is one."""
+        """Send a message once, at the next whole millisecond of boot time, which may be now."""
         boot_ms = -(-self._clock.boot_ns(now_ns) // NS_PER_MS)
         entry = (max(now_ns, self._clock.host_ns(boot_ms * NS_PER_MS)), message_id, boot_ms, ONCE)
         if entry not in self._queue:  # two requests within a millisecond are answered once, so the queue stays short

@@ -52,7 +52,7 @@ class Services:
     defaults_us: dict[int, int]
     """The messages that can be requested, each with its default interval, 0 for none."""
     reports_from_ns: int
-    """No report is sent before."""
+    """No report is sent before this time."""
     experiment: str
     """Text of the parameter SCENARIO."""
     orphaned: bool = False

@@ -7,7 +7,7 @@ from sim_vehicles.services.draws import Use, draws_of
 
 
 def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
-    """The times (ns) by which a vehicle's TIMESYNC replies are backdated, without end; none if replies are exact."""
+    """How far (ns) each of a vehicle's TIMESYNC replies is backdated: an endless series; empty if they are exact."""
     most_ns = round(scenario.autopilot.sitl.timesync_back_s * NS_PER_S)
     rng = draws_of(scenario.seed, system_id, Use.BACKDATING)
     while scenario.dynamics == "autopilot" and scenario.autopilot.sitl.timesync_back_s > 0.0:
@@ -15,7 +15,7 @@ def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
 
 
 def slips(scenario: Scenario, system_id: int, start_ns: int) -> Iterator[tuple[int, int]]:
-    """The slips of a boot clock, as (host time in ns, change in ns), without end; none if it never slips."""
+    """The slips of a boot clock, (host time in ns, change in ns): an endless series, or empty if it never slips."""
     sitl, time_ns = scenario.autopilot.sitl, start_ns
     rng = draws_of(scenario.seed, system_id, Use.SLIPS)
     while sitl.slip_s:

@@ -140,7 +140,7 @@ class Copter:
 
     @property
     def deadline_ns(self) -> int:
-        """Time of the next event that is not a report. Noted for kernels, like whether they may move the copter."""
+        """Time of the next event that is not a report. Also records for kernels this time and if they may move it."""
         ends = self._takeoff_m is not None or self.mode in (self.rules.land_mode, self.rules.return_mode)
         self._pushed = ends or self._air is not None or self._inner is not None
         alarm_ns = min(self._jump[0], self._complains_ns)
@@ -159,14 +159,14 @@ class Copter:
             clock = self._radio.clock
             self._radio.set_clock(BootClock(time_ns, clock.boot_ns(time_ns) + by_ns, clock.drift_ppb), time_ns)
             if text:
-                self._radio.tell(time_ns, text)
+                self._radio.note_change(time_ns, text)
         elif time_ns == self._complains_ns:
             self._complains_ns = NEVER_NS if self._ready(time_ns) else time_ns + self._complaint_ns
             if not self._ready(time_ns):
-                self._radio.say(time_ns, f"PreArm: {_NO_POSITION}")
+                self._radio.send_text(time_ns, f"PreArm: {_NO_POSITION}")
         elif self.armed and self.landed:
             self.armed = False
-            self._radio.tell(time_ns, "disarmed: not taken off")
+            self._radio.note_change(time_ns, "disarmed: not taken off")
         else:
             self._lose_setpoints(time_ns)
 
@@ -180,8 +180,8 @@ class Copter:
         self._target = self._own_target()
         if self.rules.guided_mode != self.rules.takeoff_mode:
             self.mode, self._stopped = self.rules.hold_mode, True
-        self._radio.tell(time_ns, "set-points stopped")
-        self._radio.say(time_ns, "No offboard signal" if self.failsafe else "Guided: no set-points, stopping")
+        self._radio.note_change(time_ns, "set-points stopped")
+        self._radio.send_text(time_ns, "No offboard signal" if self.failsafe else "Guided: no set-points, stopping")
 
     # What arrives
 
@@ -258,7 +258,7 @@ class Copter:
             self._refusals_left -= 1
             return self.rules.arming_refused, "Arm: Accels inconsistent"
         self.armed, self._armed_ns = True, time_ns
-        self._radio.tell(time_ns, "armed")
+        self._radio.note_change(time_ns, "armed")
         if self._takeoff_m is not None:
             self._leave_ground(self._takeoff_m, time_ns)
         return _ACCEPTED
@@ -278,7 +278,7 @@ class Copter:
         self._target = self._own_target()
         if mode == self.rules.guided_mode == self.rules.takeoff_mode:
             self._setpoint_ns = time_ns  # the timeout starts with the mode
-        self._radio.tell(time_ns, self.rules.modes[mode])
+        self._radio.note_change(time_ns, self.rules.modes[mode])
         return _ACCEPTED
 
     def _take_off(self, command: mavlink.Command, time_ns: int) -> int:
@@ -380,7 +380,7 @@ class Copter:
         self.flying = True
         self._target = self._own_target()._replace(altitude_m=altitude_m)
         self._setpoint_ns = None
-        self._radio.tell(time_ns, "takes off")
+        self._radio.note_change(time_ns, "takes off")
 
     def _flown(self, time_ns: int, *, foreseen: bool = False) -> tuple[Motion, Target]:
         """Motion and target at a later time."""
@@ -407,7 +407,7 @@ class Copter:
             if self.rules.takeoff_mode != self.rules.guided_mode:
                 self.mode = self.rules.hold_mode
                 self._target = self._own_target()
-            self._radio.tell(time_ns, "taken off")
+            self._radio.note_change(time_ns, "taken off")
         elif self.mode == self.rules.land_mode:
             sink = SINK_M_S if altitude_m < SINK_SLOWLY_BELOW_M else SINK_FAST_M_S
             self._target = self._target._replace(climb_m_s=-sink)
@@ -415,8 +415,8 @@ class Copter:
                 self.flying = self.armed = False
                 where_m, yaw_rad = self.motion.place_m, self.motion.yaw_rad
                 self.motion = Motion(where_m, yaw_rad=yaw_rad, inner=inner_of(self.settings))
-                self._radio.tell(time_ns, "landed")
+                self._radio.note_change(time_ns, "landed")
         elif self.mode == self.rules.return_mode and length(self.motion.place_m - self.home_m) < HOME_M:
             self.mode = self.rules.land_mode
             self._target = self._own_target()
-            self._radio.tell(time_ns, self.rules.modes[self.mode])
+            self._radio.note_change(time_ns, self.rules.modes[self.mode])

@@ -55,7 +55,7 @@ class DoubleIntegrator:
         mavlink.HOME_POSITION: 0,
         mavlink.POSITION_TARGET: 0,
     }
-    """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
+    """Slow defaults, as on an autopilot's telemetry port. MAV_CMD_SET_MESSAGE_INTERVAL changes the rates."""
 
     _state_ns = Cell[int]()
     _altitude_m = Cell[float]()
@@ -156,7 +156,7 @@ class DoubleIntegrator:
             return reason
         if on_launcher:
             self._state_ns = time_ns  # the launcher has held it until now
-            self._radio.tell(time_ns, "flying")
+            self._radio.note_change(time_ns, "flying")
         self.move(time_ns)
         if setpoint.frame != frames.LOCAL_NED:
             setpoint = setpoints.to_local(setpoint, self._state.yaw_rad)
@@ -203,7 +203,7 @@ class DoubleIntegrator:
         was = self.flight.armed
         result = self.flight.arm(command.param1 == 1.0)
         if self.flight.armed != was:
-            self._radio.tell(time_ns, "armed" if self.flight.armed else "disarmed")
+            self._radio.note_change(time_ns, "armed" if self.flight.armed else "disarmed")
         return result
 
     def _take_off(self, time_ns: int) -> int:
@@ -211,7 +211,7 @@ class DoubleIntegrator:
         result = self.flight.take_off(time_ns)
         if result == mavlink.ACCEPTED:
             self._state_ns = time_ns
-            self._radio.tell(time_ns, "flying")
+            self._radio.note_change(time_ns, "flying")
         return result
 
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
@@ -224,7 +224,7 @@ class DoubleIntegrator:
         if (self.flight.mode, self.flight.failsafe) != before:
             self.move(time_ns)
             self._command = self._alone()
-            self._radio.tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
+            self._radio.note_change(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result, ""
 
     # Timed events
@@ -237,8 +237,8 @@ class DoubleIntegrator:
         self.flight.fail()
         self._command = self._alone()
         text = f"failsafe: {self.flight.failsafe} stopped"
-        self._radio.tell(time_ns, text)
-        self._radio.say(time_ns, text)
+        self._radio.note_change(time_ns, text)
+        self._radio.send_text(time_ns, text)
 
     def _alone(self) -> Command:
         """The command without set-points: that of the loop on board, if it may fly, else constant velocity."""
@@ -361,5 +361,5 @@ class DoubleIntegrator:
         counters = self._radio.counters
         counters["model_faults"] += 1
         if counters["model_faults"] == 1:
-            self._radio.tell(self._state_ns, f"fault in its dynamics: {text}")
-            self._radio.say(self._state_ns, f"dynamics: {text}"[:50])  # at most the characters of one chunk
+            self._radio.note_change(self._state_ns, f"fault in its dynamics: {text}")
+            self._radio.send_text(self._state_ns, f"dynamics: {text}"[:50])  # at most the characters of one chunk

@@ -19,7 +19,7 @@ MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "
 
 
 _STOPPED = ("", "set-points", "station heartbeat")
-"""Name of the stream that stopped, by its number in the record; the first is for outside the failsafe."""
+"""Name of the stream that stopped, by its number in the record; 0 means no failsafe."""
 
 
 @kernel

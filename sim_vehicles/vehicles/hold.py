@@ -40,7 +40,7 @@ class Hold:
         arrival_ms = -(-clock.boot_ns(time_ns) // NS_PER_MS) - key_ms
         self.lag_ms = self._lag_ms(arrival_ms)
         due_ns = clock.host_ns((key_ms + self.lag_ms) * NS_PER_MS)
-        if key_ms >= self._newest_ms:  # a lag that shrinks lets no set-point overtake those before it
+        if key_ms >= self._newest_ms:  # when the lag shrinks, no set-point may overtake an earlier one
             due_ns = max(due_ns, self._newest_ns)
         if due_ns < time_ns:
             return False

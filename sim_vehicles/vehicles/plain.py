@@ -1,8 +1,7 @@
 """Runs the common events of plain vehicles in kernels: the station's set-points, heartbeats and TIMESYNC, and reports.
 
-The set-points of a plain craft act at once, and it reports its true state (`Craft.is_plain`).
-If its links are plain, too (`Link.plain`), a kernel runs its events in order of time, as `Shell` does, and stops before
-one that takes Python.
+The set-points of a plain craft act at once, and it reports its true state (`Craft.is_plain`). If its links are plain,
+too (`Link.plain`), a kernel runs its events in order of time, as `Shell` does, and stops before one that takes Python.
 """
 
 from math import cos, nan, pi, sin

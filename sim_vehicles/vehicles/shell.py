@@ -89,12 +89,12 @@ class Radio:
     def send(self, frame: bytes, time_ns: int) -> None:
         self.out.append((frame, time_ns))
 
-    def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
+    def send_text(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
         """Send a STATUSTEXT."""
         self.send(self.encoder.statustext(severity, text), time_ns)
 
-    def tell(self, time_ns: int, text: str) -> None:
-        """Note a change, for whoever runs the simulation."""
+    def note_change(self, time_ns: int, text: str) -> None:
+        """Record a change, for whoever runs the simulation."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
     def record(self, kind: int, boot_ms: int, time_ns: int) -> None:
@@ -143,7 +143,7 @@ Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the typ
 
 
 class Shell(Generic[Flown]):
-    """A vehicle as its link sees it. `experiment` is the text of its parameter SCENARIO."""
+    """A vehicle as seen over its link. `experiment` is the text of its parameter SCENARIO."""
 
     _asked_ts1 = Cell[int]()
     _version_1 = Cell[bool]()
@@ -212,7 +212,7 @@ class Shell(Generic[Flown]):
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
         if self._version_1 and message_id != frames.HEARTBEAT:
-            return  # no station has been heard that could want it
+            return  # no station that wants it has been heard yet
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
         if message_id == frames.TIMESYNC:
@@ -259,8 +259,8 @@ class Shell(Generic[Flown]):
                 self._obey(message, self.craft.acts_at(time_ns))
             elif text := authority.refusal(source, counters):
                 # No COMMAND_ACK: the station could not tell it from the answer to an equal command of its own.
-                self.radio.tell(time_ns, text)
-                self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
+                self.radio.note_change(time_ns, text)
+                self.radio.send_text(time_ns, text, mavlink.SEVERITY_WARNING)
 
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
         if heartbeat.type != frames.STATION_TYPE:
@@ -291,7 +291,7 @@ class Shell(Generic[Flown]):
         elif isinstance(message, SetMode):
             mode = message.custom_mode if message.base_mode & mavlink.BASE_MODE_CUSTOM else None
             if text := self.craft.change_mode(mode, time_ns)[1]:
-                self.radio.say(time_ns, text)
+                self.radio.send_text(time_ns, text)
         else:
             for frame in self.services.answer(message, self.radio.counters, time_ns):
                 self.radio.send(frame, time_ns)
@@ -307,4 +307,4 @@ class Shell(Generic[Flown]):
         for message in more:
             radio.send(radio.encoder.pack(message), time_ns)
         if answer is not None and answer[1]:
-            radio.say(time_ns, answer[1])
+            radio.send_text(time_ns, answer[1])
