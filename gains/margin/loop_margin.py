@@ -31,7 +31,7 @@ from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 from gains.sampled._loop import HeldPlant, held_blocks, lifted_map, radius_of
 
-# largest multiple of the unknown, in units of the common divisor of all
+# largest multiple of the unknown, in units of the common divisor of all multiples
 _MOST_STEPS = 200
 # most digits printed
 _DIGITS = 6
@@ -141,7 +141,7 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     unit = _common_divisor([term.multiple for term in model.terms])
-    # in the common divisor of the delays; the unknown is that divided by `unit`
+    # analysed in units of the common divisor of the delays, `unit` times the unknown; results are scaled back
     read = [
         DelayedTerm(term.matrix, term.fixed_s if term.matrix.any() else 0.0, int(term.multiple / unit))
         for term in model.terms
@@ -203,8 +203,8 @@ def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysi
 def _fixed_note(fixed: int, where: str) -> tuple[str, ...]:
     """Note on the roots that are left out; empty if there are none."""
     stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
-    why = "an equilibrium, as the common value of a consensus"
-    return (f"{stay} at {where} ({why}); all else is said of the others",) if fixed else ()
+    why = "an equilibrium, such as the common value of a consensus"
+    return (f"{stay} at {where} ({why}); everything else is about the other roots",) if fixed else ()
 
 
 def _held_moving(model: HeldModel) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int]:
@@ -295,7 +295,7 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
         omega = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))]))) / period_s
         crossings = (MarginCrossing(omega, margin_s, 1, None, None, _map_error(map_at, margin_s)),)
     at_once = [(np.linalg.eigvals(lifted_map(part, 0.0)), copies) for part, copies in parts]
-    beyond = "" if margin_s == inf else "; longer delays than its margin were not looked at"
+    beyond = "" if margin_s == inf else "; delays beyond the margin were not examined"
     return LoopMargin(
         unknown="tau",
         stable_intervals_s=((0.0, margin_s),) if margin_s > 0.0 else (),
@@ -315,16 +315,16 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
 def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
     """Rounding error (s) of the delay or period at which the spectral radius of a one-period map passes one.
 
-    At this distance, on both sides, the radius differs from one by more than rounding. The slope over a wider interval
-    gives the least of the distances tried; beside a double eigenvalue it is far from the slope at the crossing.
+    At this distance, on both sides, the radius differs from one by more than rounding. The distance is doubled until it
+    does. The first one tried comes from the slope over a wider interval, which misleads near a double eigenvalue.
     """
     if len(map_at(at_s)) > _LARGEST_MAP:
         return np.nan
     step_s = _BESIDE * at_s
     before, after = (radius_of(map_at(at_s + way * step_s)) for way in (-1.0, 1.0))
     slope = abs(after - before) / (2.0 * step_s)
-    # neighbouring numbers give maps that differ by the rounding of an exponential, far above that of an eigenvalue if
-    # the states have very different units
+    # maps of neighbouring numbers differ by the rounding of a matrix exponential. If the states have very different
+    # units, it far exceeds the rounding of an eigenvalue
     radii = [radius_of(map_at(at_s * (1.0 + k * _NEIGHBOUR))) for k in (-1, 0, 1)]
     noise = _NOISE * (max(radii) - min(radii))
     error_s = max(_radius_error(map_at(at_s)), noise) / slope if slope > 0.0 else at_s

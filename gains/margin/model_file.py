@@ -44,7 +44,7 @@ _FORMS = (
     ("A", "B", "C", "D"),
     ("num", "den"),
 )
-_DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
+_DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, such as "tau" or "2*tau"'
 # squares and products of the largest entries do not overflow; the square of a product of two least ones is still normal
 _LARGEST, _LEAST = 1e30, 1e-60
 # strings that stand for runs of zeros, longest first; a zero byte does not occur in hand-written models
@@ -113,7 +113,7 @@ def parse_model(text: str) -> DelayModel | HeldModel:
 def with_short_zeros(text: str) -> str:
     """The text of a model, or part of it, with each run of zeros replaced by one string.
 
-    `parse_model` reads both; with many states, zeros would take most of its time.
+    `parse_model` reads both. With many states, reading zeros would take most of its time.
     """
     for name, count in _ZEROS.items():
         for zero in (" 0.0,", " 0,"):
@@ -219,7 +219,7 @@ def _square(key: str, value: Any, size: int | None = None) -> FloatArray:
     if matrix.shape[0] != matrix.shape[1]:
         raise BadModelError(f"{key}: read {_size(matrix)}, wanted a square matrix")
     if size is not None and len(matrix) != size:
-        raise BadModelError(f"{key}: read {_size(matrix)}, wanted {size}x{size} as the first matrix")
+        raise BadModelError(f"{key}: read {_size(matrix)}, wanted {size}x{size} like the first matrix")
     return matrix
 
 

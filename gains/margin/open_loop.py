@@ -1,7 +1,7 @@
 """Loops given as an input-output system: from python-control, from `scipy.signal`, or from a model file.
 
-The loop is closed by u(t) = -y(t - tau), the negative unit feedback that margins of open loops refer to. Gains of
-another sign or size belong to the system: -K (s I - A)^{-1} B for u = +K x. Neither package is imported; a system is
+The loop is closed by u(t) = -y(t - tau), the negative unit feedback that margins of open loops refer to. Any other gain
+or sign must be part of the system: -K (s I - A)^{-1} B for u = +K x. Neither package is imported; a system is
 recognised by its attributes.
 """
 
@@ -21,8 +21,8 @@ def delayed_feedback(system: Any) -> tuple[FloatArray, FloatArray]:
     `system` has the attributes A, B, C and D, like a `StateSpace`, or `num` and `den` with the highest power first,
     like a `TransferFunction` with one input and one output. A0 = A, A1 = -B C, both (n, n) in 1/s.
 
-    Raises BadModelError if the system has neither, is discrete in time, has a direct path from input to output (its
-    loop then has infinitely many roots near a vertical line), or does not have as many outputs as inputs.
+    Raises BadModelError if the system has neither set of attributes, is discrete in time, has a direct path from input
+    to output (its loop then has infinitely many roots near a vertical line), or has not as many outputs as inputs.
 
     1 / (s (s + 1)) has a phase margin of 51.8° at 0.786 rad/s, a delay of 1.15 s at that frequency:
 
@@ -86,7 +86,7 @@ def _polynomial(name: str, value: Any) -> FloatArray:
     except (TypeError, ValueError):
         nested = np.zeros((2, 0))
     if any(length != 1 for length in nested.shape[:-1]):
-        raise BadModelError(f"{name} is not one polynomial; of several inputs or outputs A, B, C and D are wanted")
+        raise BadModelError(f"{name} is not one polynomial; for several inputs or outputs, A, B, C and D are wanted")
     known = np.trim_zeros(real_matrix(name, nested.reshape(1, -1))[0], "f")
     if not known.size and name == "den":
         raise BadModelError("den is zero; a polynomial is wanted")

@@ -1,8 +1,9 @@
 """Second opinions on an analysis of one unknown delay, and the error of its margin.
 
-There are three: a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`), and on both sides of the ends
-of windows the rightmost root or, for large loops or if a root at zero is left out, a root count by the argument
-principle. None shares algebra with the exact analysis. A difference beyond rounding raises DisagreementError.
+The first is a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`). The second is the rightmost root
+on both sides of the ends of windows. For large loops, or if a root at zero is left out, a root count by the argument
+principle replaces it. None shares algebra with the exact analysis. A difference beyond rounding raises
+DisagreementError.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,13 +20,13 @@ from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
 # largest sum of n^3 over blocks of n states: a sweep takes 0.2 s there, and 0.08 s for one block of 12 states
 _SWEEP_BUDGET = 14_000
-# largest number of states times points in a discretised spectrum: 30 ms
+# largest number of states times points in a discretised spectrum, which takes 30 ms
 _SPECTRUM_BUDGET = 200
-# largest turn (rad) of the longest delay at the highest frequency for a root count: 0.1 s
+# largest turn (rad) of the longest delay at the highest frequency for a root count, which takes 0.1 s
 _COUNT_BUDGET = 1000.0
-# frequencies in a count at zero delay; largest number of frequencies times n^3 for inverses of n states: 4 s
+# frequencies in a count at zero delay; largest number of frequencies times n^3 for n states, which takes 4 s
 _COUNT_POINTS, _INVERSE_BUDGET = 400, 1e10
-# rad; roots are near the axis at delays within this angle, at their frequency, of a crossing
+# the roots of a crossing are still near the axis if the delay differs by less than this angle (rad) at their frequency
 _NEAR_TURN = 0.2
 # the spectrum is computed at this distance inside and outside a window, relative to its end
 _BESIDE = 1e-4
@@ -43,7 +44,7 @@ _TOUCH = 1e-7
 def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root below and above it.
 
-    A hundred times slower: for a design to be flown, not for use inside an optimisation. Arguments as for
+    It takes a hundred times as long: use it for a design to be flown, not inside an optimisation. Arguments as for
     `gains.delay.constant.delay_margin`. Raises BadModelError unless the matrices are square, finite and of one size,
     and DisagreementError, with the result of each method, if the methods differ.
 
@@ -61,7 +62,7 @@ def second_opinions(
 ) -> tuple[tuple[str, ...], float]:
     """The methods that confirm an analysis of x'(t) = sum of the terms, and the estimated error (s) of its margin.
 
-    It uses only methods that take a fraction of a second; if `thorough`, every method, at more delays.
+    Only methods that take a fraction of a second are used; if `thorough`, all of them, at more delays. Raises
     DisagreementError if a method contradicts the analysis. The error of a margin of 0 or `inf` is 0.
     """
     margin_s, error_s = analysis.delay_margin_s, 0.0

@@ -77,7 +77,7 @@ def test_held_loop_may_state_its_period() -> None:
         ('{"A0": [[1]], "A0": [[1]], "A1": [[1]]}', "A0: read twice, wanted once"),
         ('{"A0": [[1, 2], [3]], "A1": [[1]]}', "A0: read rows of [1, 2] numbers, wanted rows of equal length"),
         ('{"A0": [[1, 2]], "A1": [[1]]}', "A0: read 1x2, wanted a square matrix"),
-        ('{"A0": [[1]], "A1": [[1, 2], [3, 4]]}', "A1: read 2x2, wanted 1x1 as the first matrix"),
+        ('{"A0": [[1]], "A1": [[1, 2], [3, 4]]}', "A1: read 2x2, wanted 1x1 like the first matrix"),
         ('{"A0": [], "A1": [[1]]}', "A0: read [], wanted a matrix as a list of rows"),
         ('{"A0": [[]], "A1": [[1]]}', "A0: read [[]], wanted at least one number in a row"),
         ('{"A0": 3, "A1": [[1]]}', "A0: read 3, wanted a matrix as a list of rows"),
