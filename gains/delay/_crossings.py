@@ -99,7 +99,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
 
 
 def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, places: ComplexArray) -> list[Crossing]:
-    """All crossings of one block, touches included; near each, on the imaginary axis, is one of the `places`."""
+    """All crossings of one block, touches included; each must have one of the `places` near it, close to the axis."""
     highest = highest_frequency(terms)
     candidates = _near_axis(places, highest)
     points = separating_points(candidates, highest)
@@ -116,7 +116,7 @@ def _near_axis(roots: ComplexArray, highest: float) -> FloatArray:
 
 
 def _near_crossings(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
-    """Numbers, one of which is near every crossing of the imaginary axis; of a sweep if the block is large."""
+    """Numbers, one of which is near every crossing of the imaginary axis; if the block is large, those of a sweep."""
     if B.shape[1] == 1:
         return unit_gain_roots(A0, B, C)
     if A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
@@ -252,7 +252,7 @@ def nearly_null(M: ComplexArray, scale: float) -> tuple[float, ComplexArray, Com
     """The least singular value of M (n, n), and the singular vectors U, V (n, k) of it and those close to it.
 
     If M v = 0 and u*M = 0, the last column and row of the inverse of M bordered by b and c* are multiples of v and u*,
-    and its norm is at least one over the second least singular value: a tenth of the time of a decomposition.
+    and its norm is at least one over the second least singular value. The inverse takes a tenth of the time of an SVD.
     """
     n = len(M)
     # no symmetry of a loop makes its singular vectors orthogonal to this border

@@ -27,7 +27,7 @@ _LEAST = float(np.finfo(np.float64).tiny)
 _NEAR_UNIT = 1.0
 # two crossings closer together than this (relative) coincide; it is below the error of a double eigenvalue, sqrt(eps)
 _SAME_PLACE = 1e-10
-# a locus whose log modulus is below this at such a frequency is on the unit circle
+# where crossings coincide, a locus whose log modulus is below this is on the unit circle
 _ON_CIRCLE = 1e-8
 # a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60
@@ -88,7 +88,7 @@ def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
 
 
 def remembered(loci: Loci, omega: FloatArray) -> Loci:
-    """The loci as a function that evaluates no frequency twice; it begins with `omega` (k,), all together."""
+    """The loci as a function that evaluates no frequency twice; those of `omega` (k,) are computed now, in one call."""
     known = dict(zip(omega.tolist(), loci(omega), strict=True))
 
     def remembering(omega: FloatArray) -> ComplexArray:

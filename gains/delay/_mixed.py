@@ -39,7 +39,7 @@ _LARGEST_STACK = 200_000
 _MOST_TURN, _MISSED, _HALVINGS = 1.0, 0.2, 40
 # the slope is a difference over this share of the gap between frequencies, which amplifies rounding a thousandfold
 _SLOPE_STEP = 1e-3
-# least frequency of that grid if there is a root at zero, as a share of the highest
+# least frequency of a count if there is a root at zero, as a share of the highest
 _LEAST_FREQUENCY = 1e-7
 
 
@@ -150,7 +150,7 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     highest = parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
     zero = _SYMMETRIC * float(parts.norms.sum())
-    if highest <= zero:  # no delay: all roots are real
+    if highest <= zero:  # a symmetric matrix and no delay: all roots are real
         others = np.arange(hurwitz.size) != np.argmin(np.abs(hurwitz)) if at_zero else slice(None)
         return int(np.count_nonzero(hurwitz[others].real > zero))
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))

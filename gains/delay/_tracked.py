@@ -23,8 +23,8 @@ _NARROWEST = 1e-7
 # points in an interval, from 0 to 1, at which branches are evaluated
 _PLACES = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
 _FREE = (_PLACES * (1.0 - _PLACES)) ** 2
-# error of a quintic in units of its difference from the cubic: that of a branch with a kink inside the interval, as
-# made by two eigenvalues that avoid each other
+# bound on the error of a quintic, in units of its difference from the cubic, if the branch has a kink inside the
+# interval, where two eigenvalues avoid each other
 _KINK = 3.0
 # above the largest slope of t^2 (1 - t)^2, 0.19: an error may have that slope in units of its bound
 _STEEP = 0.2
@@ -254,7 +254,7 @@ def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: Comple
             v = v + step[:, :n, 0] + by_theta[:, np.newaxis] * step[:, :n, 1]
         theta, omega = theta + by_theta, omega + by_omega
         size, before = float(np.maximum(np.abs(by_omega) / scale, np.abs(by_theta)).max(initial=0.0)), size
-        # quadratic convergence: the next step is to this one as the square of this one is to that of the last
+        # quadratic convergence: the next step is about size**3 / before**2
         if size <= _KNOWN and size**3 <= _DONE * before**2:
             return _Found(theta, omega, -np.sign(b.imag).astype(np.intp))
     # rounding may keep the last steps from shrinking

@@ -57,10 +57,10 @@ class DelayAnalysis:
 
 @dataclass(frozen=True)
 class ZeroPassage:
-    """Passage of a real root, at `delay_s`, by the root that stays at s = 0: to the right (+1, unstable) or left (-1).
+    """A real root passes the one that stays at s = 0, at `delay_s`: to the right (+1, unstable) or to the left (-1).
 
-    `direction` is 0 if no root passes at a positive delay; `delay_s` is then infinite or not positive. All multiples of
-    tau are multiples of `unit`.
+    `direction` is 0 if no root passes at a positive delay; `delay_s` is then infinite or not positive. `unit` divides
+    all multiples of tau.
     """
 
     delay_s: float
@@ -70,8 +70,8 @@ class ZeroPassage:
     def is_seen_as(self, crossing: Crossing, highest: float) -> bool:
         """Whether a crossing is an artefact of rounding at the root that stays at zero.
 
-        The locus of that root has modulus one to rounding at low frequencies, so its noise may cross one many times,
-        at each angle of tau that is a whole turn of `unit` tau.
+        At low frequencies the modulus of that root's locus is one to rounding, so noise may carry it across one many
+        times, wherever `unit` tau is a whole turn.
         """
         omega = crossing.omega_rad_s
         apart_s = crossing.delay_s - (self.delay_s if np.isfinite(self.delay_s) else 0.0)
@@ -121,7 +121,7 @@ def first_critical_delay_s(blocks: Sequence[BlockAnalysis]) -> float:
     leaving = any(crossing.delay_s == 0.0 and crossing.direction > 0 for crossing in crossings)
     if leaving or any(block.fixed_on_axis or block.unstable > 0 for block in blocks):
         return 0.0
-    # a root that leaves to the left without delay crosses again a period later
+    # a root that moves to the left from the axis at zero delay crosses again a period later
     return min((crossing.delay_s or 2.0 * pi / crossing.omega_rad_s for crossing in crossings), default=inf)
 
 
@@ -198,7 +198,7 @@ def stability_windows(
     unstable += int(change[at_zero & (change > 0)].sum())
     first = np.where(at_zero, period_s, first)
     wanted_s, complete_to_s = _last_delay(omega, first, change, unstable, horizon_s)
-    # a window that begins by then ends when a root enters, within one period of the fastest entering sequence
+    # a window that begins by `wanted_s` ends when a root enters, within one period of the fastest entering sequence
     entering = change >= 0 if bool(np.any(change >= 0)) else np.full(change.size, True)
     returns_s = np.where(period_s < inf, np.maximum(first, wanted_s + period_s), np.where(first < wanted_s, inf, first))
     last_s = min(float(returns_s[entering].min()), max(float(first.max()), wanted_s + float(period_s.min())))

@@ -1,8 +1,8 @@
 """Rightmost characteristic roots of a linear system with any number of constant delays.
 
 x'(t) = sum_k A_k x(t - tau_k) is u' = D u on functions over [-tau_max, 0]. On Chebyshev points D is a matrix whose
-eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact. Only
-what the delayed terms see of the past is kept, C x with A_k = A_k C'C for all of them: few numbers if inputs are few.
+eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact. Of the
+past only C x is kept, with A_k = A_k C'C for every delayed term: few numbers if inputs are few.
 
 This approach and others are compared in D. Breda, "Methods for numerical computation of characteristic roots for delay
 differential equations: experimental comparison", Scientiae Mathematicae Japonicae Online 8 (2003), 317-328.
@@ -92,7 +92,7 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
 
 
 def _roots_among_others(matrices: FloatArray, delays: FloatArray, count: int) -> list[complex]:
-    """Roots of a block whose rightmost approximation is spurious (its delayed terms are weak), on ever finer grids.
+    """Roots of a block with weak delayed terms, where the rightmost approximation is spurious, on ever finer grids.
 
     Roots right of one at r oscillate no faster than the sum of |A_k| e^{-r tau_k}, which the points must resolve. Where
     terms cancel, this bound is far too high: two finer grids that find the same rightmost root are enough.
@@ -145,9 +145,10 @@ def _turning(matrices: FloatArray, weights: FloatArray) -> float:
 def _pseudospectral_roots(
     matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0
 ) -> tuple[ComplexArray, int]:
-    """Eigenvalues of the discretised generator, and its points; the first rows are the equation, others differentiate.
+    """Eigenvalues of the discretised generator, and its number of points.
 
-    Each of the `further` roots to the left makes one more turn over the longest delay and takes four more points.
+    The first rows are the equation, the others differentiate. Each of the `further` roots to the left makes one more
+    turn over the longest delay and takes four more points.
     """
     n, longest = matrices.shape[1], float(delays.max())
     _, singular, seen = np.linalg.svd(matrices[1:].reshape(-1, n), full_matrices=False)
