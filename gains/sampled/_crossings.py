@@ -27,7 +27,7 @@ from gains.sampled._loop import SampledPlant, block_radius, lifted_map, split_de
 # least number of fractions m of a period at which the angles are computed; more if the loop is fast for its period
 _FRACTIONS = 8
 _REFINEMENTS = (1, 4, 16)
-# turns of a locus that are tried at the finer fractions: angles of a twentieth of a period meet a whole q in about 20
+# turns of a locus tried at the finer fractions: an angle that exists for 1/20 of a period meets a whole q in about 20
 _TURNS = 40
 # loci below this at eight fractions do not reach one between them
 _SMALL = 0.8
@@ -35,8 +35,8 @@ _SMALL = 0.8
 _LARGEST_CHECK = 120
 # fractions of the margin at which it is checked: the radius changes by about a part in 10^6, its error is 1e-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
-# a radius this near to one is no evidence: at a whole period it may pass one with no slope; at a multiple eigenvalue,
-# one within its rounding, up to this
+# a radius within the first of one is no evidence: at a whole period it may pass one with no slope. Near a multiple
+# eigenvalue one within its rounding error is none either, up to the second
 _AT_ONE, _MOST_ERROR = 1e-11, 1e-3
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
@@ -75,7 +75,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
 
 
 def _has_small_loci(plant: SampledPlant) -> bool:
-    """Whether every locus stays far below one: looks at finer fractions would find no angle."""
+    """Whether every locus stays so far below one that finer fractions would yield no angle."""
     angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
     angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
     loops = (
@@ -201,7 +201,7 @@ def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
 def _newton(plant: SampledPlant, delay_s: float, angle: float, *, multiple: bool = False) -> float:
     """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
 
-    Beside a multiple root steps shrink slowly, and stop far above 1e-9. Such ends count if `multiple`.
+    Near a multiple root steps shrink slowly and stop far above 1e-9. The last iterate then counts if `multiple`.
     """
     start_s, previous = delay_s, inf
     for _ in range(30):

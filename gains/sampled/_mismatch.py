@@ -4,10 +4,10 @@ At its ends det(I - N) = 0 on the unit circle, see `gains.sampled._predicted_dif
 Its starting points come from loci: with a delay of q + m common periods, q whole and m below 1, N = z^{-q} S_m - S^, so
 z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus is independent of q and changes little with m. If N is large,
 the starting points are the crossings of the continuous loop, and delays inside the window are tested too. A kink is a
-delay at which a command starts to act as a state is sampled. Loci can miss a short interval of instability around one,
-so kinks are tested if they are few. Each end is confirmed on either side by the spectrum of the map of one common
-period, or by Nyquist's criterion if that map is large. If that finds an end nearer to the assumed delay, bisection
-provides starting points closer to it.
+delay at which a command starts to act just as a state is sampled. Loci can miss a short interval of instability around
+a kink, so kinks are tested if they are few. Each end is confirmed on either side by the spectrum of the map of one
+common period, or by Nyquist's criterion if that map is large. If these tests show that the window ends nearer to the
+assumed delay, bisection provides starting points closer to that end.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ _TRIED, _AT_ASSUMED = 16, 1e-9
 # Newton's method: most steps; last step of a converged solution (control periods); increments for derivatives, as
 # shares of angle and period
 _STEPS, _SOLVED, _DIFFERENCE = 8, 1e-9, 1e-7
-# further steps, each of which leaves a fixed part of the distance to a multiple solution; least singular value there,
-# and where it is worth them
+# further steps, each of which leaves a fixed part of the distance to a multiple solution; least singular value up to
+# which they are worth taking
 _STEPS_TO_MULTIPLE, _NEARLY = 40, 1e-4
 # states of the largest map whose spectrum is computed; most kinks tested, times the control periods in a common one
 _LARGEST_CHECK, _KINKS = 40, 600
@@ -91,7 +91,7 @@ class _Search:
         self.stable = dict[float, bool]()
 
     def is_stable_within(self, shorter_s: float, longer_s: float) -> bool:
-        """Whether its ends are beyond these mismatches (s), by the crossings of the continuous loop and a few tests."""
+        """Whether the block's window extends beyond these mismatches (s), by continuous crossings and a few tests."""
         aside_s = continuous_crossings(self.plant, self.assumed_s)[1]
         near_s = _FAR * np.array([shorter_s, longer_s]) + self.timing.held_s
         if np.any((aside_s > -near_s[0]) & (aside_s < near_s[1])):
@@ -140,7 +140,7 @@ class _Search:
         return inf
 
     def _kinks(self, way: float, most_s: float) -> list[float]:
-        """The nearest mismatches (s) up to `most_s` at which a command starts to act as a state is sampled."""
+        """The nearest mismatches (s) up to `most_s` at which a command starts to act just as a state is sampled."""
         if highest_crossing(self.plant, self.assumed_s) * self.timing.held_s <= _SLOW:
             return []
         first_s = np.unique((way * (self.loop.samples_s + self.timing.spread_s - self.assumed_s)) % self.tick_s)
@@ -191,7 +191,7 @@ class _Search:
         return np.append(here_s - self.assumed_s, self._refined(angle, delays_s - self.assumed_s))
 
     def _least_singular(self, angle: FloatArray, delays_s: FloatArray) -> FloatArray:
-        """The least singular value of I - N beside its terms (k,), at rounding where an eigenvalue is on the circle."""
+        """The least singular value of I - N relative to its terms (k,): rounding if an eigenvalue is on the circle."""
         return self.loop.least_singular(self.loop.at(angle), self.loop.answers(delays_s))
 
     def _is_stable(self, delay_s: float) -> bool:

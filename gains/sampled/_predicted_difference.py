@@ -33,7 +33,7 @@ _SMALL = 0.95
 # largest relative change of det(I - N) between neighbouring angles; parts into which an interval is divided to meet it;
 # most such refinements; the modulus that replaces zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
-# least singular value of I - N, beside its terms, up to which it is rounding; refinements before it is computed
+# least singular value of I - N, relative to its terms, up to which it is rounding; refinements before it is computed
 ROUNDING, _UNCHECKED = 1e-14, 3
 
 
@@ -149,7 +149,7 @@ class PredictedDifference:
         return np.where(values == 0.0, _LEAST, values)
 
     def least_singular(self, grid: Grid, answers: Answers) -> FloatArray:
-        """The least singular value of I - N beside its terms (k,)."""
+        """The least singular value of I - N relative to its terms (k,)."""
         least = np.linalg.svd(self.differences(grid, answers), compute_uv=False)[:, -1]
         return least / (1.0 + np.linalg.norm(grid.assumed, axis=(1, 2)))
 

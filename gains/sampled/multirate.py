@@ -47,11 +47,11 @@ _MOST_PERIODS = 30.0
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
 _NEAR_ONE = 0.99
-# looks are closer where the radius of a common period exceeds this to the power of the commands in it
+# delays are closer where the radius exceeds this to the power of the number of commands in a common period,
 _NEAR_ONE_COMMAND = 0.95
-# and where it reaches one by changing this many times as much as between the last looks
+# and a change this many times that over the last delays would take it to one
 _CHANGES = 3.0
-# instants at which a command meets a sample are dense if they are closer than this share of a step of looks
+# delays at which a command starts to act just as a state is sampled are dense if closer than this share of a step
 _DENSE = 0.4
 
 
@@ -288,8 +288,9 @@ def _merged(instants: list[float], close_s: float) -> list[float]:
 def first_unstable(radius: Callable[[float], float], looks: Sequence[float], timing: Timing) -> float:
     """The least mean loop delay at which the radius reaches one: 0 if at the first of `looks`, `inf` if at none.
 
-    The radius has a kink wherever an acting instant meets a sample. Where it comes near one, it is also read at every
-    kink and at three delays between: it may pass one and return within a single step of `looks`.
+    `looks` are ascending delays (s). The radius has a kink wherever a command starts to act just as a state is sampled.
+    Where it comes near one, it is also computed at every kink and at three delays in each gap: it may pass one and
+    return within a single step of `looks`.
     """
     near, met, radii = _NEAR_ONE_COMMAND**timing.commands, list[tuple[float, float]](), list[float]()
     for i, look in enumerate(looks):
@@ -310,9 +311,9 @@ def first_unstable(radius: Callable[[float], float], looks: Sequence[float], tim
 
 
 def _closer_looks(after_s: float, before_s: float, timing: Timing) -> list[float]:
-    """Three delays between two; also those at which an acting instant may meet a sample, and three between each two.
+    """The kinks of the radius between two delays, and three delays in each gap.
 
-    Where these are dense, each moves few of many commands, and the radius hardly has a kink.
+    Where kinks are dense, each moves few of many commands and hardly shows, so they are left out.
     """
     ends = [after_s, before_s]
     if timing.step_s > _DENSE * (before_s - after_s):

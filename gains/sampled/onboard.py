@@ -92,11 +92,11 @@ class OnboardLoop:
         return OnboardLoop(self.A[at], self.sensed[at], self.known[at], self.late[at], self.timing)
 
     def continuous_margin_s(self) -> float:
-        """The least delay tau at which (5.2) loses stability."""
+        """The least delay tau (s) at which the continuous loop (5.2) loses stability."""
         return delay_margin(self.A + self.sensed + self.known, self.late)
 
     def sampled_margin_s(self) -> float:
-        """The least delay tau at which the loop as flown loses stability; 0 if unstable without delay, `inf` if never.
+        """The least delay tau (s) at which the loop as flown is unstable; 0 if unstable without delay, `inf` if never.
 
         DisagreementError as for `gains.sampled.constant.sampled_delay_margin`.
         """
@@ -235,7 +235,7 @@ def streamed_loop(
 
     A includes the vehicles' own loops: it is the continuous system whose states equal those of the sampled loops at
     every sensor measurement. BadModelError if none exists, because the steps are too long for the gains. Margins
-    computed with it differ from those of `OnboardLoop` by 2 parts in 10^4 at 17 1/s and 50 Hz.
+    computed with it differ from those of `OnboardLoop` by 2 parts in 10^4 for gains of 17 1/s at 50 Hz.
 
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> A, _, others = streamed_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
@@ -253,9 +253,9 @@ def streamed_loop(
     step[:n, :n], step[:n, n:] = Phi, hold
     generator = np.asarray(logm(step)) / look_s
     if np.iscomplexobj(generator) or not np.isfinite(generator).all():
-        wanted = "gains whose motion is slower than the steps of the vehicles' own loops"
         raise BadModelError(
-            f"the own loops, at steps of {look_s:g} s, turn over from step to step; {wanted} are wanted"
+            f"the motion of the vehicles' own loops changes sign at each sensor measurement, {look_s:g} s apart; "
+            "gains with a slower motion are wanted"
         )
     return generator[:n, :n], generator[:n, n:], others
 

@@ -6,8 +6,8 @@ the instant at which the new command acts if the loop delay is tau^, and feeds b
     x^(t_k + tau^) = Phi(tau^) x_k + sum_j Gamma_j u_{k-j},   u_k = K x^(t_k + tau^),
     Phi(t) = e^{A t},   Gamma_j = int Phi(tau^ - s) B ds over [tau^ - j T, tau^ - (j - 1) T] within [0, tau^]
 
-If tau^ equals the true loop delay tau, the loop behind the delay is the loop without delay. Its limit is the mismatch
-tau - tau^: the *mismatch window* is the interval of true delays around tau^ in which it is stable. Every control tick
+If tau^ equals the true loop delay tau, the loop behind the delay is the loop without delay. Otherwise the mismatch
+tau - tau^ limits it: the *mismatch window* is the interval of true delays around tau^ in which it is stable. Every tick
 predicts, so a command counts even if its sample has been used before. Loop delays are defined as in `multirate`.
 
 In continuous time u(t) = K (e^{A tau^} x(t) + int_0^tau^ e^{A s} B u(t - s) ds) gives x'(t) = A x(t) + B u(t - tau)
@@ -51,14 +51,14 @@ def mismatch_window(
     The first is 0 if the loop is stable down to zero delay, the second `inf` if no upper limit is found; both are
     `assumed_s` if the loop is unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, or
     to the q-th root of 1e-14 at a q-fold eigenvalue, as of q equal followers in mixed coordinates. Each is confirmed on
-    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large. Between
-    them the window is a search, not a proof: see `gains.sampled._mismatch`.
+    either side by the spectrum of the map of one common period, or by Nyquist's criterion if that map is large. That no
+    delay between them is unstable is the result of a search, not a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay of the prediction.
     `measured` flags the states that are sampled, all if None; the station computes the others from its commands alone.
-    K must not use those, and they must not depend on sampled states. BadModelError names an argument that does not fit;
-    DisagreementError is raised if a window ends where no eigenvalue is found on the unit circle.
+    K must not use these others, and they must not depend on sampled states. BadModelError names an argument that does
+    not fit; DisagreementError is raised if a window ends where no eigenvalue is found on the unit circle.
 
     x' = u, u = -x has a margin of 1.56 s at 50 Hz. With a station that assumes 3 s it is stable from 1.45 to 4.77 s:
 
@@ -129,6 +129,6 @@ def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequ
     if mask is None or mask.all():
         return None
     if mask.shape != (len(A),) or K[:, ~mask].any() or A[np.ix_(~mask, mask)].any():
-        wanted = f"{len(A)} flags, with K and the states not measured independent as documented, are wanted"
+        wanted = f"{len(A)} flags are wanted, such that K uses measured states only and no other state depends on these"
         raise BadModelError(f"measured is {mask.tolist()}; {wanted}")
     return mask
