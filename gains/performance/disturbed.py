@@ -122,7 +122,7 @@ class DisturbedFormation:
         return self._lifted[0]
 
     def closed(self, z: ComplexArray) -> ComplexArray:
-        """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1), from additions to the states after a period to the states.
+        """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1): from what is added to the states in a period to the states.
 
         G(z) is the effect of late, held commands; the states include the gusts.
         """
@@ -173,7 +173,7 @@ class DisturbedFormation:
         return (covariance + covariance.T) / 2.0
 
     def _of_vehicles(self, position_m: float, velocity_m_s: float) -> FloatArray:
-        """Map (states, 2 inputs) from errors of each vehicle's position and velocity, scaled so, to errors of e."""
+        """Map (states, 2 inputs) from each vehicle's position and velocity errors, in these units, to errors of e."""
         model = self.model
         M = np.zeros((model.states, 2 * model.inputs))
         for i in range(model.vehicles):
@@ -219,16 +219,16 @@ class DisturbedFormation:
         step, calm = self._stepped(self.K), self._stepped(np.zeros_like(self.K))
         # the effect of an error in e over a period
         wrong = (step - calm)[:, : model.states]
-        told, seen, noise = wrong @ self._noise, np.eye(model.states, len(step)), self._noise
+        by_noise, seen, noise = wrong @ self._noise, np.eye(model.states, len(step)), self._noise
         if self.older is not None and noise.any():
             u_before, e_before = self._of_older(self.older)
             commands = (self._stepped(np.eye(*self.K.shape)) - calm)[:, : model.inputs]
-            before = commands @ u_before if self.assumed_s is None else np.zeros_like(told)
+            before = commands @ u_before if self.assumed_s is None else np.zeros_like(by_noise)
             kept = np.eye(noise.shape[1])
-            told, noise, seen = np.vstack([told - before, kept]), noise - e_before, np.hstack([seen, e_before])
+            by_noise, noise, seen = np.vstack([by_noise - before, kept]), noise - e_before, np.hstack([seen, e_before])
             step = np.block([[step, before], [np.zeros((len(kept), step.shape[1])), 0.0 * kept]])
             wrong = np.vstack([wrong, np.zeros((len(kept), model.states))])
-        added = told @ told.T
+        added = by_noise @ by_noise.T
         added[: len(self._push_covariance), : len(self._push_covariance)] += self._push_covariance
         if self._bias.any():
             drifts, fades = np.eye(self._bias.shape[1]), exp(-T / self.sensing.bias_time_s)

@@ -88,7 +88,7 @@ class FlownFormation:
         return -highest(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())[1]
 
     def alpha_limit_s(self, alpha: float) -> float:
-        """The largest loop delay (s) up to which α is kept; `inf` if at every delay, 0 if not even without delay."""
+        """The largest loop delay (s) up to which α is at least `alpha`; `inf` if it always is, 0 if it never is."""
         margin_s, omega = self.timing.delay_margin_s, self.frequencies()
         longest_s = min(margin_s, _LONGEST / self._slowest)
         delays = np.linspace(0.0, longest_s, _DELAYS, endpoint=False).tolist()
@@ -190,12 +190,12 @@ class FlownLoop:
         """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
 
         `inf` if that holds at every delay, 0 if not even without delay. In closed form at each frequency: one part of
-        Γ = N / D rotates by e^{−jθ}, θ = ωτ, as the delay grows, so |N|² ≤ peak² |D|² is cos(θ + ψ) ≥ c. This holds
-        from |ψ| ≤ acos c up to θ = acos c − ψ. The least θ / ω is the limit.
+        Γ = N / D rotates by e^{−jθ}, θ = ωτ, as the delay grows, so |N|² ≤ peak² |D|² is cos(θ + ψ) ≥ c. If it holds
+        at θ = 0, |ψ| ≤ acos c, it holds up to θ = acos c − ψ. The least θ / ω is the limit.
         """
         k1, k2, k3 = self._k
         own_s, hold_s = self.timing.delays_s(0.0)
-        # at low frequencies |N|² − |D|² is k2² + 2 k2 k3 (front − own delay) + 2 k3 − k1² times ω², too flat to sweep
+        # at low frequencies |N|² − |D|² is (k2² + 2 k2 k3 (front − own delay) + 2 k3 − k1²) ω², too flat to sweep
         spare = k1**2 - k2**2 - 2 * k3
         if abs(spare) <= _ROUNDING * k1**2:
             spare = 0.0

@@ -197,7 +197,7 @@ def sampled_margin(
     Without responses they respond at once. Arguments and exceptions as for `formation_loop` and
     `gains.sampled.multirate.multirate_delay_margin`.
 
-    The leader of `continuous_margin`, sampled, has about 1.1506 s less half a period:
+    Sampled, the leader of `continuous_margin` has a margin of about 1.1506 s less half a period:
 
     >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
     >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)

@@ -93,7 +93,7 @@ def front_gain_range(
     k1, k3, delay_s = k1[..., None], k3[..., None], delay_s[..., None]
 
     def most(omega: FloatArray, side: float) -> FloatArray:
-        """The largest k2 at one frequency, or of the mirrored range; the width is negative where there is none."""
+        """The largest k2 at each frequency or, for side −1, minus the least; too small where no k2 qualifies."""
         lag = omega * delay_s
         flat = omega**2 - 2 * (k3 * np.cos(lag) + k1 * omega * np.sin(lag)) + k1**2
         square = string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
