@@ -202,7 +202,7 @@ def _held_model(data: dict[str, Any]) -> HeldModel:
     A = _square("A", data["A"])
     B = _matrix("B", data["B"])
     if len(B) != len(A):
-        raise BadModelError(f"B: read {_size(B)}, wanted {len(A)} rows as A has")
+        raise BadModelError(f"B: read {_size(B)}, wanted {len(A)} rows to match A")
     K = _matrix("K", data["K"])
     if K.shape != B.shape[::-1]:
         raise BadModelError(f"K: read {_size(K)}, wanted {B.shape[1]}x{len(A)}: u = K x")
@@ -219,7 +219,7 @@ def _square(key: str, value: Any, size: int | None = None) -> FloatArray:
     if matrix.shape[0] != matrix.shape[1]:
         raise BadModelError(f"{key}: read {_size(matrix)}, wanted a square matrix")
     if size is not None and len(matrix) != size:
-        raise BadModelError(f"{key}: read {_size(matrix)}, wanted {size}x{size} like the first matrix")
+        raise BadModelError(f"{key}: read {_size(matrix)}, wanted {size}x{size} to match the first matrix")
     return matrix
 
 

@@ -88,7 +88,7 @@ def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, 
     [plant] = square_matrices(A=A)
     entry, feedback = real_matrix("B", B), real_matrix("K", K)
     if entry.shape[0] != plant.shape[0]:
-        raise BadModelError(f"B has shape {entry.shape}; {plant.shape[0]} rows are wanted, like A")
+        raise BadModelError(f"B has shape {entry.shape}; {plant.shape[0]} rows are wanted, to match A")
     if feedback.shape != entry.shape[::-1]:
         raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
     return plant, entry, feedback

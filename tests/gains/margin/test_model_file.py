@@ -77,7 +77,7 @@ def test_held_loop_may_state_its_period() -> None:
         ('{"A0": [[1]], "A0": [[1]], "A1": [[1]]}', "A0: read twice, wanted once"),
         ('{"A0": [[1, 2], [3]], "A1": [[1]]}', "A0: read rows of [1, 2] numbers, wanted rows of equal length"),
         ('{"A0": [[1, 2]], "A1": [[1]]}', "A0: read 1x2, wanted a square matrix"),
-        ('{"A0": [[1]], "A1": [[1, 2], [3, 4]]}', "A1: read 2x2, wanted 1x1 like the first matrix"),
+        ('{"A0": [[1]], "A1": [[1, 2], [3, 4]]}', "A1: read 2x2, wanted 1x1 to match the first matrix"),
         ('{"A0": [], "A1": [[1]]}', "A0: read [], wanted a matrix as a list of rows"),
         ('{"A0": [[]], "A1": [[1]]}', "A0: read [[]], wanted at least one number in a row"),
         ('{"A0": 3, "A1": [[1]]}', "A0: read 3, wanted a matrix as a list of rows"),
@@ -102,7 +102,7 @@ def test_held_loop_may_state_its_period() -> None:
         ),
         ('{"A": [[1]], "B": [[1]], "K": [[1]], "hold": false}', "hold: read false, wanted true"),
         ('{"A": [[1]], "B": [[1]], "K": [[1, 2]], "hold": true}', "K: read 1x2, wanted 1x1: u = K x"),
-        ('{"A": [[1]], "B": [[1], [2]], "K": [[1]], "hold": true}', "B: read 2x1, wanted 1 rows as A has"),
+        ('{"A": [[1]], "B": [[1], [2]], "K": [[1]], "hold": true}', "B: read 2x1, wanted 1 rows to match A"),
         (
             '{"A": [[1]], "B": [[1]], "K": [[1]], "hold": true, "period": 0}',
             "period: read 0, wanted a positive number of seconds",
