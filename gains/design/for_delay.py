@@ -36,7 +36,7 @@ Reached = tuple[FloatArray, Figures]
 
 # Gains compared per search: for each free entry, and the least and the most for any family.
 _EVALUATIONS_EACH, _EVALUATIONS_LEAST, _EVALUATIONS_MOST = 50, 320, 1280
-# Most searches until the gains meet with exact figures the requirement that they met with rough ones.
+# Most searches until gains that meet the requirement with rough figures also meet it with exact ones.
 _AIMS = 4
 # A search over more than a few entries is repeated from its best point with steps divided by these: it may have started
 # so close to the optimum that nearly all first draws were worse.
@@ -298,7 +298,7 @@ def _relaxed(part: Part, reached: Reached, parts: Sequence[Part]) -> Part | None
 
 
 def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> str:
-    """Advice to relax the parts that the nearest gains miss by a common share, the last one as far as then needed."""
+    """Advice to relax all parts that the nearest gains miss: by a common share, the last as far as still needed."""
     short = [part.shortfall(nearest) for part in parts]
     for share in (max(short) * times for times in _SHARES if max(short) < _HOPELESS):
         eased = [part.eased(share) if each > 0.0 else part for part, each in zip(parts, short, strict=True)]
@@ -325,7 +325,7 @@ def _best(
 ) -> Reached:
     """The gains of least cost that meet the parts, or the nearest to them, searched from the best of the starts.
 
-    Figures are rough during the search. It is repeated with a tighter aim if exact figures miss a part.
+    Figures are rough during the search. It is repeated with tighter limits if exact figures miss a part.
     """
     limits, some_meet = parts, False
     enough = min(max(_EVALUATIONS_EACH * starts[0].size, _EVALUATIONS_LEAST), _EVALUATIONS_MOST)
@@ -333,7 +333,7 @@ def _best(
     def bounds(point: FloatArray) -> Iterator[Rank]:
         nonlocal some_meet
         figures, meets = family.figures(point), True
-        # the cost decides first only among gains that meet the limits
+        # once some gains meet the limits, a quick cost may reject others before their shortfalls are computed
         if some_meet and aim.name == "alpha_at_delay":
             yield 0.0, -figures.alpha_at_delay_most
         elif some_meet and not aim.is_slow:
@@ -365,10 +365,10 @@ def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
 
 
 def _shortfalls(figures: Figures, parts: Sequence[Part]) -> Iterator[float]:
-    """Lower bounds on the largest shortfall of gains in any part; none if they meet all.
+    """Lower bounds on the shortfall by which gains are ranked; none if they meet all parts.
 
-    The largest bound is exact, and larger still if the loop is unstable. Parts that are slow to compute are evaluated
-    only if all others are met.
+    The largest bound is that shortfall: the largest in any part, raised if a quick part is missed, and more for an
+    unstable loop. Parts that are slow to compute are evaluated only if all others are met.
     """
     if figures.decay_rate_1_s <= 0.0:
         yield _UNSTABLE - figures.decay_rate_1_s

@@ -109,7 +109,7 @@ def graph_design(
     bases = [base for base in every if base.margin_s > 0.0]
     if not bases:
         raise InfeasibleError(
-            "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop wants"
+            "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop requires"
         )
     if wanted.criteria is not None:
         asked, starts = wanted.criteria, tuple(base.K for base in bases)

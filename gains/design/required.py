@@ -1,7 +1,7 @@
 """Gains of the inclusion principle that meet a requirement, or advice on which part to relax and how far.
 
-Every combination is one search of `gains.design.search`: the figures given in the requirement are its constraints, and
-the others are maximised.
+Any combination of required figures is one search of `gains.design.search`: they are its constraints, and the others are
+maximised.
 """
 
 from dataclasses import replace
@@ -127,7 +127,7 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
             return min(alone_s) - wanted_s
         return sampled_margin(PAIR, found.K, responses, timing=timing) - wanted_s
 
-    # the response costs about its lag of the margin
+    # the response reduces the margin by about its lag
     low, high = wanted_s, wanted_s + lag_s
     f_low, f_high = excess(low), excess(high)
     while f_high < 0.0 and high < DELAY_MARGIN_MAX_S:

@@ -40,7 +40,7 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
         [[A_z Y + Y A_z' + B_z L + L'B_z' + T T', Y T^{-T}], [T^{-1} Y, −γ I]] ≺ 0,   ‖L‖ ≤ κ_L,   Y ⪰ I / κ_Y
         Y = diag(y1, y2, y1),   L = [[l1, 0, 0], [l2, l3, l1]],   A_z = T A T^{-1},   B_z = T B
 
-    This has one Schur complement less than the source: with its constant block −I, Clarabel often ends inaccurate.
+    This has one Schur complement less than the source, whose constant block −I often makes Clarabel end inaccurate.
     K = L Y^{-1} T = [[k1, 0, 0], [k2, k3, k1]] has the wanted pattern, with the same k1 twice. Unbounded gains would
     reach the supremum α = |c| / √(1 + c²); ‖K T^{-1}‖ is at most κ_L κ_Y. `shear` is c < 0 in 1/s, `gain_bound` is κ_L
     and `lyapunov_bound` is κ_Y; BadModelError for other signs. SolverError if the solver does not end with status
@@ -60,7 +60,7 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
     T = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, shear, 1.0]])
     y1, y2, l1, l2, l3 = (cp.Variable() for _ in range(5))
     Y, L = cp.diag(cp.hstack([y1, y2, y1])), cp.bmat([[l1, 0.0, 0.0], [l2, l3, l1]])
-    advice = f"raise gain_bound = {gain_bound} or lyapunov_bound = {lyapunov_bound}, or move shear = {shear} to zero"
+    advice = f"raise gain_bound = {gain_bound} or lyapunov_bound = {lyapunov_bound}, or move shear = {shear} towards 0"
     return _largest_alpha(pair.A, pair.B, T, Y, L, bounds=(gain_bound, lyapunov_bound), advice=advice)
 
 

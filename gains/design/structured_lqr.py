@@ -4,7 +4,7 @@ The gradient of the cost J(K) of `gains.design.lqr` is exact and is projected on
 towards the boundary of the stabilising gains, so a descent never leaves them. It finds a local minimum; the centralised
 optimum, in which every input uses all states, bounds how much better any other gain could be.
 
-Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), solved there by other means.
 """
 
 from collections.abc import Callable

@@ -49,7 +49,7 @@ class BaseGain:
 
 @dataclass(frozen=True)
 class BoundedMargins:
-    """The margins, of a gain for one axis, that a requirement bounds; they depend on where the loop is closed."""
+    """The margins of a gain for one axis that a requirement bounds; they depend on where the loop is closed."""
 
     model: FormationModel
     period_s: float
