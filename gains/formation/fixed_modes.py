@@ -6,7 +6,7 @@ move is fixed, because the gains that leave a free mode in place have measure ze
 plant and pattern is analysed on its own.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
-is a station.
+is a control station.
 """
 
 from dataclasses import dataclass
@@ -113,7 +113,7 @@ def distinct_modes(A: FloatArray) -> list[complex]:
 
 
 def _is_eigenvalue(matrix: FloatArray, mode: complex) -> bool:
-    """Decided by the least singular value, because rounding moves a defective eigenvalue by far more."""
+    """By the least singular value, because rounding moves a defective eigenvalue by far more than this value."""
     singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
     return float(singular[-1]) <= _RANK_TOLERANCE * float(np.linalg.norm(matrix, 2))
 
@@ -155,7 +155,7 @@ def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -
 def _links_that_help(
     plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray
 ) -> tuple[int, list[tuple[Link, int]]]:
-    """The nullity of A + B K C − λI, and every link outside the pattern that raises the rank, with the gain in rank."""
+    """The nullity of A + B K C − λI, and every link outside the pattern that raises the rank, with the increase."""
     left, singular, right = np.linalg.svd(plant.closed_loop(gain) - mode * np.eye(plant.states))
     nullity = int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
     if nullity == 0:

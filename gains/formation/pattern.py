@@ -36,9 +36,9 @@ class Plant:
         control = real_matrix("B", B)
         output = np.eye(state.shape[0]) if C is None else real_matrix("C", C)
         if control.shape[0] != state.shape[0]:
-            raise BadModelError(f"B has shape {control.shape}; {state.shape[0]} rows are wanted, as A")
+            raise BadModelError(f"B has shape {control.shape}; {state.shape[0]} rows are wanted, to match A")
         if output.shape[1] != state.shape[0]:
-            raise BadModelError(f"C has shape {output.shape}; {state.shape[0]} columns are wanted, as A")
+            raise BadModelError(f"C has shape {output.shape}; {state.shape[0]} columns are wanted, to match A")
         for name, matrix in (("A", state), ("B", control), ("C", output)):
             object.__setattr__(self, name, matrix)
 
@@ -73,7 +73,7 @@ class Pattern:
         for name, wanted in zip(("input_sizes", "output_sizes"), blocks.shape, strict=True):
             sizes = tuple(getattr(self, name))
             if len(sizes) != wanted:
-                raise BadModelError(f"{name} = {sizes} has {len(sizes)} entries; {wanted} are wanted, as the blocks")
+                raise BadModelError(f"{name} = {sizes} has {len(sizes)} entries; {wanted} are wanted, to match blocks")
             if any(size != int(size) or size < 1 for size in sizes):
                 raise BadModelError(f"{name} = {sizes}; positive whole numbers are wanted")
             object.__setattr__(self, name, tuple(int(size) for size in sizes))
@@ -133,9 +133,9 @@ def bidirectional(formation: FormationModel) -> Pattern:
 
 
 def overlapping(formation: FormationModel, *, ahead: int = 1, behind: bool = False, leader: bool = False) -> Pattern:
-    """Every vehicle uses its own output and those of `ahead` vehicles in front; `behind` and `leader` add those.
+    """Every vehicle uses its own output and those of `ahead` vehicles in front.
 
-    It overlaps more than the source's (4.6). BadModelError if `ahead` is below 1.
+    `behind` adds the vehicles behind it, `leader` adds the leader. BadModelError if `ahead` is below 1.
 
     >>> overlapping(FormationModel((-1, 0, 1, 2)), ahead=2, leader=True).blocks.astype(int).tolist()
     [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
@@ -197,7 +197,7 @@ def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
     gain = real_matrix("K", K)
     mask = pattern.mask
     if gain.shape != mask.shape:
-        raise BadModelError(f"K has shape {gain.shape}; {mask.shape} is wanted, as the pattern")
+        raise BadModelError(f"K has shape {gain.shape}; {mask.shape} is wanted, to match the pattern")
     foreign = np.argwhere((gain != 0.0) & ~mask)
     if foreign.size:
         row, column = (int(k) for k in foreign[0])
@@ -214,7 +214,7 @@ def check_fits(plant: Plant, pattern: Pattern) -> None:
     if (plant.B.shape[1], plant.C.shape[0]) != (pattern.inputs, pattern.outputs):
         raise BadModelError(
             f"the pattern has {pattern.inputs} inputs and {pattern.outputs} outputs; {plant.B.shape[1]} and "
-            f"{plant.C.shape[0]} are wanted, as the plant"
+            f"{plant.C.shape[0]} are wanted, to match the plant"
         )
 
 
