@@ -49,7 +49,7 @@ def alpha_bound(A: FloatArray, B: FloatArray, delay_s: float, *, price: float = 
     seconds("delay_s", delay_s)
     n = len(state)
     if len(entry) != n:
-        raise BadModelError(f"B has shape {entry.shape}; {n} rows are wanted, as A")
+        raise BadModelError(f"B has shape {entry.shape}; {n} rows are wanted, to match A")
     if (rank := int(np.linalg.matrix_rank(entry))) < min(entry.shape):
         raise BadModelError(f"B has the rank {rank}; {min(entry.shape)} is wanted")
     positive_number("price", price)

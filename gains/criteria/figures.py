@@ -201,7 +201,7 @@ class LoopFigures(DelayFreeFigures):
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
         """How far (s) the loop delay may deviate from a mean on both sides with the loop proved stable.
 
-        With a `rate` of 0, the delay is constant but unknown, and the result is exact. Any other is covered by
+        With a `rate` of 0, the delay is constant but unknown, and the result is exact. Any other rate is covered by
         `gains.varying.jitter.spread_bound`, approximately in a search. 0 if the loop is unstable at the mean.
         """
         A, B, K = formation_loop(self.model, self.K, self.responses)

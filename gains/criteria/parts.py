@@ -63,19 +63,19 @@ class Part:
     def relaxed(self, figures: Figures) -> Self | None:
         """The part relaxed to what gains reach; None if that is not positive or not finite."""
         reached = self.figure(figures)
-        return self._for(reached) if 0.0 < reached < inf else None
+        return self._limited_to(reached) if 0.0 < reached < inf else None
 
     def eased(self, share: float) -> Self:
         """The part relaxed by a share, given as a logarithm."""
-        return self._for(self.wanted * exp(-share if self.at_least else share))
+        return self._limited_to(self.wanted * exp(-share if self.at_least else share))
 
     @property
     def advice(self) -> str:
         """The change of a requirement that gives it this part."""
         return f"{'lower' if self.at_least else 'raise'} {self.name} to {self.wanted_text}"
 
-    def _for(self, reached: float) -> Self:
-        """The part with a limit equal to its text: the value, rounded to the easier side."""
+    def _limited_to(self, reached: float) -> Self:
+        """The part with this limit, rounded to the easier side so that it equals its text."""
         return replace(self, wanted=float(f"{rounded(reached, up=not self.at_least):.6g}"))
 
 

@@ -9,7 +9,7 @@ All commands together are u = (I - k_ff N)^{-1} K x^, with N = 1 where i follows
 blocks of K. Feed-forward therefore changes neither the roots nor the margin, only the coupling between vehicles. With
 K2 = -K1 and k_ff = 1 a follower repeats the motion in front exactly, and no spacing error arises at any delay.
 
-The station knows a commanded motion before it happens. Between two samples it propagates down the chain as
+The station knows a commanded motion before it happens. From vehicle to vehicle, such a motion propagates as
 
     U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),
 
@@ -204,7 +204,7 @@ class PredictedFigures(DelayFreeFigures):
     def growth(self, omega: FloatArray, *delays_s: float) -> FloatArray:
         """|U_i / U_j| (k,) of the follower of a stable loop at frequencies omega (k,), rad/s, up to pi / `period_s`.
 
-        The largest over the true delays.
+        Each value is the largest over the true delays `delays_s`.
         """
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
         front, own = np.array(self._seen(self._loop[2][1:2], z, delays_s))[:, :, 0].T
@@ -254,13 +254,13 @@ class PredictedFigures(DelayFreeFigures):
 
     def _settled_noise(self, delay_s: float) -> float:
         """`_noise` from the stationary covariance of the last commands, which are states of the one-period map."""
-        n, told = len(self._plant.A), self.model.states
+        n, reported = len(self._plant.A), self.model.states
         plant, timing = replace(self._plant, K=self._fed_forward), Timing(self.period_s, self.period_s)
         loop, calm = (
             multirate_map(own, timing, delay_s=delay_s, predictor=Predictor(own, self.assumed_s))
             for own in (plant, replace(plant, K=0.0 * plant.K))
         )
-        entry = (loop - calm)[:, :told]
+        entry = (loop - calm)[:, :reported]
         covariance = settled_covariance(loop, entry @ entry.T)
         if covariance is None:
             return inf
