@@ -24,11 +24,11 @@ from gains.varying.bounds import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]
 
-# numbers of frequencies at which the scaling is chosen, the gain is evaluated, or roughly so in a search for gains
+# numbers of frequencies at which the scaling is chosen, the gain is evaluated, and the same in a search for gains
 _FREQUENCIES_SCALING, _FREQUENCIES_GAIN, _FREQUENCIES_ROUGH = 60, 4000, 600
 # bisections of the gain reached by a scaling; the gain is evaluated again afterwards, so few are enough
 _HALVINGS = 12
-# the gain is searched: its peak may be higher by this share
+# the peak of the gain is found by a search; the true peak may be higher by this share
 _GRID_ERROR = 1e-3
 
 

@@ -1,4 +1,4 @@
-"""How early or late set-points may act in a predicted loop that is proved stable.
+"""How early or late set-points may act with a predicted loop still proved stable.
 
 The station predicts as in `gains.sampled.prediction`. A set-point u_j, computed at the tick t_j = j T, is assumed to
 act at t_j + D, with a constant *delivery delay* D. In fact it acts at any instant between t_j + D - e and t_j + D + l,
@@ -92,7 +92,7 @@ class PredictedSpread:
             raise BadModelError(f"mean_s is {mean_s}, telemetry_s {telemetry_s}; numbers of seconds >= 0 are wanted")
         off_s = mean_s - seconds("assumed_s", self.assumed_s)
         period_s, regular = self.timing.control_s, telemetry_s == 0.0 and self.timing.ticks == 1
-        # by how much the age of the newest state varies, held until the next, and how long no newer one may arrive
+        # by how much the age of the newest state varies, which grows until the next arrives; how long that may take
         varies_s = 0.0 if regular else 2.0 * telemetry_s + self.timing.telemetry_s
         gap_s = self.timing.telemetry_s * (ceil((period_s + varies_s) / self.timing.telemetry_s - _ROUNDING) - 1)
         windows = 1 if regular else ceil(gap_s / period_s - _ROUNDING)
