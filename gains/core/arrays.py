@@ -32,7 +32,7 @@ def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_on
     """e^{X t} (k, n, n) of one matrix X (n, n) for k durations t, by a Taylor polynomial, scaling and squaring.
 
     `less_one` gives e^{X t} - I, with all its digits however short t is. All durations share the powers of X: SciPy's
-    `expm` takes 60 us for each matrix of a stack. The last ones are kept: a search asks for those of one plant only.
+    `expm` takes 60 us for each matrix of a stack. The last results are cached: a search needs those of one plant only.
     """
     at_s = np.asarray(durations, np.float64).tobytes()
     return _exponentials(len(generator), np.asarray(generator, np.float64).tobytes(), at_s, less_one)

@@ -18,7 +18,7 @@ from gains.core.errors import SolverError
 Inequalities = Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
 
 # With Clarabel's own tolerance of 1e-8 and its longest step, larger synthesis problems (bounds of 300 on two axes)
-# sometimes end "optimal_inaccurate". Feasibility problems need more digits: 1e-8 costs a per cent of some delay bounds.
+# sometimes end "optimal_inaccurate". Feasibility problems need more digits: 1e-8 costs 1 % of some delay bounds.
 _SYNTHESIS_TOLERANCE, _SYNTHESIS_STEP, _FEASIBILITY_TOLERANCE = 1e-7, 0.9, 1e-11
 # eigenvalues of a symmetric matrix of size n are known to n eps times its norm
 _EPS = float(np.finfo(np.float64).eps)

@@ -2,9 +2,9 @@
 
 A leader-follower tree is block triangular. Its identical followers share one defective eigenvalue, whose multiplicity
 N is the depth of the tree, and rounding spreads it over a circle of radius eps^(1/N): from about eight vehicles on,
-every method that works on the whole matrix returns wrong verdicts. The strongly connected components of the pattern
-are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of their spectra, so
-each block is analysed on its own, and equal blocks only once.
+every method that works on the whole matrix returns wrong verdicts. The strongly connected components of the pattern of
+nonzero entries are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of
+their spectra, so each block is analysed on its own, and equal blocks only once.
 """
 
 import heapq
@@ -50,7 +50,9 @@ def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
         checked.append(matrix)
         size = len(checked[0])
         if len(matrix) != size:
-            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, as the other matrices")
+            raise BadModelError(
+                f"{name} has shape {matrix.shape}; {size}x{size} is wanted, to match the other matrices"
+            )
     return checked
 
 
