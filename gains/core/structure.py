@@ -50,9 +50,7 @@ def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
         checked.append(matrix)
         size = len(checked[0])
         if len(matrix) != size:
-            raise BadModelError(
-                f"{name} has shape {matrix.shape}; {size}x{size} is wanted, to match the other matrices"
-            )
+            raise BadModelError(f"{name} has shape {matrix.shape}; {size}x{size} is wanted, to match the others")
     return checked
 
 

@@ -145,10 +145,9 @@ def _turning(matrices: FloatArray, weights: FloatArray) -> float:
 def _pseudospectral_roots(
     matrices: FloatArray, delays: FloatArray, further: int, finer: float = 1.0
 ) -> tuple[ComplexArray, int]:
-    """Eigenvalues of the discretised generator, and its number of points.
+    """Eigenvalues of the discretised generator, whose first rows are the equation, and its number of points.
 
-    The first rows are the equation, the others differentiate. Each of the `further` roots to the left makes one more
-    turn over the longest delay and takes four more points.
+    Each of the `further` roots to the left makes one more turn over the longest delay and takes four more points.
     """
     n, longest = matrices.shape[1], float(delays.max())
     _, singular, seen = np.linalg.svd(matrices[1:].reshape(-1, n), full_matrices=False)

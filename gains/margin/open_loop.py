@@ -22,7 +22,7 @@ def delayed_feedback(system: Any) -> tuple[FloatArray, FloatArray]:
     like a `TransferFunction` with one input and one output. A0 = A, A1 = -B C, both (n, n) in 1/s.
 
     Raises BadModelError if the system has neither set of attributes, is discrete in time, has a direct path from input
-    to output (its loop then has infinitely many roots near a vertical line), or has not as many outputs as inputs.
+    to output (its loop then has infinitely many roots near a vertical line), or has more outputs than inputs or fewer.
 
     1 / (s (s + 1)) has a phase margin of 51.8° at 0.786 rad/s, a delay of 1.15 s at that frequency:
 

@@ -2,8 +2,7 @@
 
 The first is a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`). The second is the rightmost root
 on both sides of the ends of windows. For large loops, or if a root at zero is left out, a root count by the argument
-principle replaces it. None shares algebra with the exact analysis. A difference beyond rounding raises
-DisagreementError.
+principle replaces it. None shares algebra with the analysis. A difference beyond rounding raises DisagreementError.
 """
 
 from collections.abc import Iterator, Sequence

@@ -107,8 +107,7 @@ class CoupledBlock:
         """Whether the sampled loop is stable if each vehicle has its own loop delay.
 
         Decided by the continuous model, with the hold counted as the delay that gives equal links the margin of the
-        sampled loop. Over long links, computing the growth takes a thousand times as long. `age_s` as for
-        `growth_continuous_at_1_s`.
+        sampled loop. Over long links, growth takes a thousand times as long. `age_s` as for `growth_continuous_at_1_s`.
         """
         delays_s = [loop_delay_s[system_id] + self._hold_s for system_id in self.system_ids]
         if age_s is not None and self.extrapolated is not None:

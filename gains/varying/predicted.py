@@ -1,4 +1,4 @@
-"""How early or late set-points may act with a predicted loop still proved stable.
+"""How early or late set-points may act while a predicted loop is still proved stable.
 
 The station predicts as in `gains.sampled.prediction`. A set-point u_j, computed at the tick t_j = j T, is assumed to
 act at t_j + D, with a constant *delivery delay* D. In fact it acts at any instant between t_j + D - e and t_j + D + l,
