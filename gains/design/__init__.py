@@ -3,5 +3,6 @@
 Inclusion: `required` turns a requirement into one `search` for the gains of a follower. Graph: `graph` takes base gains
 from `structured_lqr` (cost in `lqr`) or `dk_iteration`, and `time_scale` brings them to the requirement. For both,
 `for_delay` searches for gains at a loop delay that meet further criteria, and `predicted` for gains with prediction.
-`front` compares both routes over many delays. `robust_lmi` has designs to compare with.
+`front` compares both routes over many delays. `robust_lmi` has designs to compare with. The room has one file more than
+twelve, as each method is read on its own.
 """
