@@ -29,7 +29,7 @@ from gains.delay._windows import DelayAnalysis, combined_analysis
 from gains.delay.constant import Crossing
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
-from gains.sampled._loop import HeldPlant, held_blocks, lifted_map, radius_of
+from gains.sampled._loop import HeldPlant, held_blocks, lifted_map, radius_of, sensitivity
 
 # largest multiple of the unknown, in units of the common divisor of all multiples
 _MOST_STEPS = 200
@@ -339,13 +339,8 @@ def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
 def _radius_error(matrix: FloatArray) -> float:
     """Rounding error of the spectral radius of a one-period map."""
     size = len(matrix)
-    eigenvalues, vectors = np.linalg.eig(matrix)
     epsilon = _BACKWARD * size * float(np.finfo(np.float64).eps) * float(np.linalg.norm(matrix))
-    # the angle between left and right eigenvectors of the largest eigenvalue determines its condition
-    k = int(np.argmax(np.abs(eigenvalues)))
-    left = np.linalg.svd(matrix - eigenvalues[k] * np.eye(size))[0][:, -1]
-    angle = abs(complex(left.conj() @ vectors[:, k]))
-    return min(epsilon / max(angle, 1e-300), epsilon ** (1.0 / max(size, 2)))
+    return min(epsilon * sensitivity(matrix), epsilon ** (1.0 / max(size, 2)))
 
 
 def _common_divisor(multiples: list[Fraction]) -> Fraction:

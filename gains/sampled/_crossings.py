@@ -22,7 +22,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
 from gains.delay._loci import delay_loci, sweep_frequencies, unit_crossings, unit_gain_roots, with_extrema
-from gains.sampled._loop import SampledPlant, block_radius, lifted_map, split_delay
+from gains.sampled._loop import SampledPlant, block_radius, lifted_map, sensitivity, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more if the loop is fast for its period
 _FRACTIONS = 8
@@ -303,8 +303,5 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
 def _radius_error(plant: SampledPlant, delay_s: float) -> float:
     """By how much rounding may have moved the spectral radius: far if its eigenvalue is nearly a multiple one."""
     step = lifted_map(plant, delay_s)
-    values, vectors = np.linalg.eig(step)
-    k = int(np.argmax(np.abs(values)))
-    left = np.linalg.svd(step - values[k] * np.eye(len(step)))[0][:, -1]
-    angle = abs(complex(left.conj() @ vectors[:, k]))
-    return min(len(step) * float(np.finfo(np.float64).eps * np.linalg.norm(step)) / max(angle, 1e-300), _MOST_ERROR)
+    epsilon = len(step) * float(np.finfo(np.float64).eps * np.linalg.norm(step))
+    return min(epsilon * sensitivity(step), _MOST_ERROR)

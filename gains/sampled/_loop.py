@@ -119,6 +119,14 @@ def radius_of(step: FloatArray) -> float:
     return float(np.abs(np.linalg.eigvals(step)).max())
 
 
+def sensitivity(step: FloatArray) -> float:
+    """By how much a small error of a map, in its norm, moves the spectral radius: large near a multiple eigenvalue."""
+    eigenvalues, vectors = np.linalg.eig(step)
+    k = int(np.argmax(np.abs(eigenvalues)))
+    left = np.linalg.svd(step - eigenvalues[k] * np.eye(len(step)))[0][:, -1]
+    return 1.0 / max(abs(complex(left.conj() @ vectors[:, k])), 1e-300)
+
+
 def block_radius(plant: SampledPlant, delay_s: float) -> float:
     """Spectral radius of the one-period map of one block."""
     return radius_of(lifted_map(plant, delay_s))

@@ -1,9 +1,11 @@
 """Absent vehicles: lost, left out, landed, disarmed, or flown by a pilot or by the autopilot on its own account."""
 
 from collections.abc import Sequence
+from math import nan
 
 from gcs.autopilot.kinds import HAS_LANDED, WAS_DISARMED
 from gcs.link.vehicle import RemoteVehicle
+from scenarios.kernel import Records
 
 LOST, TAKEN_OVER = "is lost", "is taken over by its pilot or its autopilot"
 LEFT_OUT = "is left out: it did not become ready"
@@ -23,6 +25,15 @@ GROUNDED = (HAS_LANDED, WAS_DISARMED)
 """Why a vehicle on the ground is absent; others may fly over it."""
 PILOTED = (TAKEN_OVER, *GROUNDED)
 """Why a vehicle is absent that its pilot flies, or has landed or disarmed."""
+
+
+def off_the_ground(controls: Records, absent: Sequence[str]) -> Records:
+    """The controls without the states of vehicles on the ground: they are not near those that fly over them."""
+    if not any(absent):
+        return controls
+    kept = controls.copy()
+    kept["state"][[why in GROUNDED for why in absent]] = nan
+    return kept
 
 
 def describe_change(was: str, now: str) -> str:

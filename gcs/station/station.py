@@ -25,7 +25,7 @@ from gcs.link.datagram import Arrivals, Block, Datagram, Outbox
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import HEARTBEAT, RemoteVehicle, heartbeats_to, in_words, note_requests, set_points_to
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import GROUNDED, LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason
+from gcs.station.absence import LEFT_OUT, LOST, PILOTED, absence, describe_change, end_reason, off_the_ground
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fast_path import (
     COMING,
@@ -286,7 +286,7 @@ class Station:
         """
         judged = tick.judged or self._judged_by_kernels(tick.due_ns)
         down_m = judged.reported["down_m"] if self._limits.has_slots else np.empty(0)
-        near = nearest(self._off_the_ground(judged.controls), tick.due_ns, down_m)
+        near = nearest(off_the_ground(judged.controls, self._why_absent), tick.due_ns, down_m)
         if self.phase is Phase.FLYING:
             self._take_back(judged.controls)
             away = dict.fromkeys(self._monitor.away, False)
@@ -296,14 +296,6 @@ class Station:
         own_ns = at_ns[tick.set_point_indices]  # -1, for vehicles that were sent none, selects the last one
         rows, self._used_s[:] = tick_rows(tick, judged, self._fleet.links, near.distance_m, own_ns)
         return rows
-
-    def _off_the_ground(self, controls: Records) -> Records:
-        """The controls without the states of vehicles on the ground: they are not near those that fly over them."""
-        if not any(self._why_absent):
-            return controls
-        kept = controls.copy()
-        kept["state"][[why in GROUNDED for why in self._why_absent]] = nan
-        return kept
 
     # -- the control tick ------------------------------------------------------------------------------------------
 

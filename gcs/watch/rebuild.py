@@ -28,7 +28,7 @@ from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
-from gcs.station.absence import GROUNDED, absence
+from gcs.station.absence import GROUNDED, absence, off_the_ground
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.modes import VehicleState
 from gcs.station.reception import new_reported
@@ -282,11 +282,8 @@ class _Rebuilding:
             own.remote.system_id: text for own, text in zip(self._vehicles, why, strict=True) if text in GROUNDED
         }
         self._grounded = grounded if flying else self._grounded
-        off_the_ground = controls.copy()
-        off_the_ground["state"][[text in GROUNDED for text in why]] = nan
-        near = nearest(
-            off_the_ground, due_ns, self._reported["down_m"] if self._scenario.has_altitude_slots else np.empty(0)
-        )
+        down_m = self._reported["down_m"] if self._scenario.has_altitude_slots else np.empty(0)
+        near = nearest(off_the_ground(controls, why), due_ns, down_m)
         ids = [vehicle.remote.system_id for vehicle in self._vehicles]
         if self._outline.exchanges:
             self._judge_silence(due_ns)
