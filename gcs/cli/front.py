@@ -37,7 +37,7 @@ _GAINS = {
 
 
 def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, LinkPart | None]":
-    """The scenario with gains for the links of --links-of, and the reason for the choice; unchanged without it.
+    """The scenario with gains for the links in --links-of, and why these gains; without that option, unchanged.
 
     A scenario without `for_link` loses its gains, its method and its requirements on margin, alpha and decay.
     """
@@ -59,8 +59,8 @@ def chosen_now(
 ) -> "tuple[Scenario, LinkPart]":
     """Measure the links of a scenario now, and return it with gains for them and the reason for these gains.
 
-    The links are measured through `link`, or in virtual time if it is None. `there` takes over simulated
-    vehicles that run already; if there are none, they are started. It is None if other vehicles are to be flown.
+    The links are measured through `link`, or in virtual time if it is None. `there` takes over simulated vehicles
+    that run already; if none do, they are started. It is None if other vehicles are to be flown.
     """
     from gcs.watch.before_flight import measured_now
     from gcs.watch.for_link import best_for

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # it imports the schema of scenarios, which a JSON model does
 
 _ROWS = 20
 """Maximum number of rows in a table."""
-_PART = 1 << 18
+_CHUNK = 1 << 18
 """Number of characters read from a file at once."""
 
 
@@ -68,7 +68,7 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
 def _json_of(file: Path) -> str:
     """The text with its many zeros shortened: the model of 1,000 vehicles takes 40 MB."""
     with file.open(encoding="utf-8-sig") as text:
-        return "".join(with_short_zeros(part) for part in iter(partial(text.read, _PART), ""))
+        return "".join(with_short_zeros(part) for part in iter(partial(text.read, _CHUNK), ""))
 
 
 def _mat_as_json(file: Path) -> str:

@@ -108,9 +108,9 @@ def load_scenario(
     """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
     `left_out` are system ids of vehicles to leave out, `links` names a profile that replaces its links, and
-    `link_delay_s` replaces their delay, each way. A scenario that names code is refused unless `allow_code` is true; a
-    text there says in the refusal what is wanted instead. Raises scenarios.errors.ScenarioError if the file cannot be
-    used, or not with this loop, without these vehicles, or with these links.
+    `link_delay_s` replaces their delay, each way. A scenario that names code is refused unless `allow_code` is True;
+    if it is a text, the refusal says that this is wanted instead. Raises scenarios.errors.ScenarioError if the file
+    cannot be used, or not with this loop, without these vehicles, or with these links.
     """
     from scenarios.files import load, with_loop, with_profile
     from scenarios.left_out import without
@@ -288,13 +288,13 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
 
 
 def refuse_alone(option: str, value: object, needed: str, *given: object) -> None:
-    """Refuse an option that was given without any of those that it needs; None was not given."""
+    """Refuse an option given without any of the options that it needs. The value of an option not given is None."""
     if value is not None and all(other is None for other in given):
         raise InputError(f"read {option} without {needed}, wanted it with {needed}")
 
 
 def unmet_headroom(found: float | None, least: float, of: str = "") -> str:
-    """The message for an --assert-headroom that does not hold; empty if the headroom found, `of` these, is enough."""
+    """The message for an --assert-headroom that does not hold, or "". `of` says whose headroom was `found`."""
     if found is not None and found >= least:
         return ""
     read = "no headroom" if found is None else beyond(100.0 * found, 100.0 * least, 1) + "%"

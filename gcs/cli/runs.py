@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 
 def grade(run: RunFolder, as_json: AsJson = False) -> None:
-    """Compare a flight's latencies with the truth log.
+    """Compare the latencies measured in a flight with the true ones.
 
-    Shows the errors of the measured latencies and of the emulated link delays.
+    The vehicles that the station started log the true ones. Also shows the errors of the emulated link delays.
     """
     from gcs.runs.grade import grade as graded
 

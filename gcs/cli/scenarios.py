@@ -244,11 +244,11 @@ def design(
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
     front: Annotated[
-        bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
+        bool, typer.Option("--front", help="show the best α and decay at several delays, with and without prediction")
     ] = False,
     at: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", min=0.001, max=10, help="take the gains of the front at this loop delay"),
+        typer.Option(metavar="SECONDS", min=0.001, max=10, help="use the gains of the front at this loop delay"),
     ] = None,
     maximise: Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: the quantity to maximise")] = "alpha",
     predict: Annotated[

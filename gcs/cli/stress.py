@@ -65,7 +65,7 @@ def stress(
         typer.Option(metavar="ID", help="like --onset, but slow only this vehicle's link; the others stay as they are"),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(metavar="FRACTION", help="relative distance of the last flights from the onset")
+        float, typer.Option(metavar="FRACTION", help="how near the onset the last flights are, as a fraction of it")
     ] = 0.02,
     seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights at each point, each with its own seed")] = 1,
     workers: Annotated[
@@ -84,7 +84,7 @@ def stress(
         float | None,
         typer.Option(
             metavar="FRACTION",
-            help="exit with code 1 if onset and margin differ by more, or its error is larger; implies --onset",
+            help="exit with code 1 if onset and margin differ by more, or the onset's error is larger; implies --onset",
         ),
     ] = None,
     allow_code: options.AllowCode = False,
@@ -105,8 +105,8 @@ def stress(
 
     Simulated autopilots fly in virtual time. Their response is identified first, and the margin takes it into account.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, all trials were aborted, disturbances are
-    predicted to break the formation but no onset with --disturbance was measured, or a trial flown again differs.
+    Exit code 1 if --assert-onset is missed, a trial failed, all trials were aborted, a trial flown again differs, or,
+    with --disturbance, onsets were predicted but none was measured.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
     given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]

@@ -61,7 +61,7 @@ def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode 
 
 
 def thesis(out: options.OutFolder = None, as_json: options.AsJson = False) -> None:
-    """Reproduce the thesis: published against computed figures."""
+    """Reproduce Sahoo's thesis: published against computed figures."""
     from gcs.studies import thesis as source
     from gcs.views.console import progress
 
@@ -81,7 +81,7 @@ def thesis(out: options.OutFolder = None, as_json: options.AsJson = False) -> No
 def bench(
     scenario_file: options.ScenarioFile = Path("triangle5"),
     vehicles: Annotated[
-        int, typer.Option(metavar="N", min=0, max=MOST_VEHICLES, help="number of vehicles, in columns behind a leader")
+        int, typer.Option(metavar="N", min=0, max=MOST_VEHICLES, help="N vehicles in columns; 0: those of the scenario")
     ] = 0,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="duration of each flight")] = 8.0,
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="number of flights; the fastest counts")] = 10,
@@ -105,15 +105,15 @@ def bench(
     allow_code: options.AllowCode = False,
     as_json: options.AsJson = False,
 ) -> None:
-    """Measure how much faster than real time flights are computed.
+    """Measure how much faster than real time a flight is computed.
 
     Also measures the share of its control period that the station needs, and compares the time of its whole tick with
     the time that pymavlink takes to parse the positions.
 
     With --peers, the same work is done by this station and by pymavlink, MAVSDK, JSBSim, python-control and solvers, if
-    they are installed. Formations of 5, 20 and 100 vehicles fly over UDP, or one of --vehicles.
+    they are installed. Formations of 5, 20 and 100 vehicles fly over UDP; with --vehicles, only one of that size.
 
-    With --cluster, the map is flown twice on Dask: by one local worker and by all. Each trial flies for --seconds.
+    With --cluster, a map is flown twice on Dask: by one local worker, then by all. Each trial flies for --seconds.
     """
     from gcs.cli.results import print_benchmark, print_cluster, print_peers, print_real_time
     from gcs.preflight.faults import bad_start, endless_link
