@@ -1,4 +1,4 @@
-"""Reads and writes the files of a run's folder; each file has its only reader here.
+"""Reads and writes the scenario, design, ticks, events and summary in the folder of a run.
 
 A damaged file, or one of another kind, raises gcs.errors.InputError with a one-line message.
 """

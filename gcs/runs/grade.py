@@ -1,8 +1,8 @@
 """Grades measured latencies against the truth recorded by vehicles and emulated links, for `gcs grade`.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
-loop delay, repetition included, runs from when the state was sampled until the set-point computed from it acts; the
-truth has both times by the time_boot_ms of the messages.
+loop delay, repetition included, runs from when the state was sampled until the set-point computed from it acts. The
+truth log has both times, keyed by the time_boot_ms of the messages.
 """
 
 import itertools
@@ -120,7 +120,7 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
     """The true age (s) of the state behind each row's set-point when the set-point acted.
 
-    NaN where the set-point never acted, or its state is unknown. `ticks` must be whole, with a row for every vehicle.
+    NaN where the set-point never acted, or its state is unknown. Each tick must have a row for every vehicle.
     """
     sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
     states = ticks[["system_id", "sample_boot_ms"]][_rows_used(ticks)].tolist()
@@ -189,7 +189,7 @@ def _first_ns(truth: Truth, which: NDArray[np.bool_], keys: IntArray) -> IntArra
 def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
     """`commands_of` for loops on board: the states are the oldest that each streamed command needed.
 
-    `ticks` must be whole, with a row for every vehicle.
+    Each tick must have a row for every vehicle.
     """
     acted, delays_s = instants(truth, ACTED), true_loop_delays_s(ticks, truth)
     own = (ticks["system_id"] == system_id) & np.isfinite(delays_s)

@@ -22,16 +22,16 @@ class Refusals:
     """Remembers which refusals have been reported."""
 
     def __init__(self) -> None:
-        self._told: dict[str, int] = {}
+        self._reported: dict[str, int] = {}
 
     def news(self, counters: Counter[str], *, last: bool = False) -> dict[str, int]:
         """All counts by reason if a reason is new, or with `last` if any count has changed; empty otherwise."""
-        if not last and counters.keys() <= self._told.keys() | _IGNORED:
+        if not last and counters.keys() <= self._reported.keys() | _IGNORED:
             return {}
         counts = {reason: count for reason, count in counters.items() if reason not in _IGNORED}
-        if counts == self._told:
+        if counts == self._reported:
             return {}
-        self._told = counts
+        self._reported = counts
         return counts
 
 

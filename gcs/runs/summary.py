@@ -55,7 +55,7 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
 
     `unwritten`, given only at the end of a flight, holds the events that could not be written. Files that cannot be
     written now are then named in `not_logged`, and without a Parquet file the tick log is kept. Raises InputError if
-    the folder is not a run or has a damaged file, and OSError if a file cannot be written but `unwritten` is None.
+    the folder is not a run or has a damaged file, and OSError if a file cannot be written and `unwritten` is None.
     """
     scenario = read_scenario(folder)
     design = read_design(folder / record.DESIGN_FILE)
@@ -359,9 +359,9 @@ def _flown_spread(
 
 
 def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> FloatArray:
-    """(2, n, n): weight w of the report before the newest in k's position and velocity at i's newest state.
+    """(2, n, n): weight w of the older report where k's position and velocity are interpolated to i's newest state.
 
-    See `history.state_at`. w varies as clocks drift; its mean here keeps the variance w^2 + (1 - w)^2 of white noise.
+    See `history.state_at`. w varies as clocks drift; this one gives white noise its mean variance, w^2 + (1 - w)^2.
     """
     period_ns = NS_PER_S / scenario.rates.telemetry_hz
     ticks, at = np.unique(flown["tick"], return_inverse=True)
