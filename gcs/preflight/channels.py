@@ -23,15 +23,15 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import ACTED, MemoryRecorder
 
 _FLIGHTS, _VEHICLES = 8, 24
-"""Maximum number of flights, and of vehicles in all of them: among many vehicles of one flight, phases differ."""
+"""Maximum number of flights, and of vehicles in all of them; the phases of many vehicles differ within one flight."""
 _SECONDS, _PERIODS = 5.0, 20
 """Each flight lasts this long, or this many periods of telemetry if they are longer; its first half is not counted."""
 _WIDE = 1e3
-"""Factor on the bandwidth with which all that is offered passes."""
+"""With the bandwidth multiplied by this, no datagram is dropped."""
 _PATIENCE_S, _ROUND_TRIPS = 60.0, 40.0
-"""A flight that has not begun by then, plus so many round trips, is not waited for."""
+"""A flight is given up if it has not begun after this time plus this many round trips."""
 _ALTITUDE_M = 10.0
-"""Vehicles that take off climb no higher, which changes nothing on their links. Autopilots refuse much less."""
+"""Vehicles take off to at most this altitude; their links do not depend on it. Autopilots refuse much lower ones."""
 
 _ANY = Response(lag_s=0.1, velocity_gain_1_s=0.0)
 """Stands in for responses that a flight would have to identify first; they change no delay."""
@@ -41,7 +41,7 @@ class OverChannels(NamedTuple):
     """The loop delays of the vehicles by system id, and how full the channels are."""
 
     drawn: dict[int, DrawnDelays]
-    """A row for each flight. Without the vehicles of which no command acted in some flight."""
+    """A row for each flight. A vehicle is left out if none of its commands acted in one of the flights."""
     effective_s: dict[int, float]
     """The effective loop delay, the mean over the flights; infinite if next to nothing arrived in one of them."""
     use: dict[str, float]
@@ -75,7 +75,7 @@ def _over_wide(plan: FlightPlan) -> FlightPlan:
 
 
 def _start(plan: FlightPlan, seed: int) -> OverChannels:
-    """The second half of one short flight, which no error of the formation ends; nothing in it if it does not begin."""
+    """The delays in the second half of one short flight without safety limits; empty if the flight does not begin."""
     calm = plan.scenario.with_calm_monitor()
     lasts_s = max(_SECONDS, _PERIODS / calm.rates.telemetry_hz)
     vehicles = (own.model_copy(update={"altitude_m": min(calm.altitude_of(own), _ALTITUDE_M)}) for own in calm.vehicles)
@@ -118,7 +118,7 @@ def _delays(flight: Flight) -> dict[int, DrawnDelays]:
 
 
 def _stacked(flights: list[DrawnDelays]) -> DrawnDelays:
-    """The delays of several flights, each repeated up to the same length."""
+    """The delays of several flights, each repeated up to the length of the longest."""
     most = max(flown.down_s.size for flown in flights)
     ages_s, down_s = (
         np.concatenate([np.resize(each, (1, most)) for each in column]) for column in zip(*flights, strict=True)

@@ -82,7 +82,7 @@ class ScenarioCheck(Published):
     expected_loop_delay_s: float
     phase_s: float
     """Half the shorter period of telemetry and control. The phase between the two stays about the same during a flight:
-    its loop delay is up to this much longer or shorter than expected, and its links take as much less or more."""
+    its loop delay is up to this much longer or shorter than expected, and its links tolerate that much less or more."""
     effective_loop_delay_s: float | None
     """The constant loop delay of equal effect on stability: longer with jitter or losses, because older commands keep
     acting. That of the vehicle left with the least headroom; None if next to nothing arrives."""
@@ -102,13 +102,13 @@ class ScenarioCheck(Published):
     delay_margin_s: float | None
     """None if no delay makes the loop unstable; with prediction, the upper end of the mismatch window."""
     assumed_delay_s: float | None
-    """The loop delay that the prediction assumes: the expected one if it is measured in flight. None without one."""
+    """The loop delay that the prediction assumes: the expected one if it is measured. None without prediction."""
     mismatch_window_s: tuple[float, float] | None
     """The shortest and the longest loop delay at which the predicted loop is stable; None without prediction, or if no
     delay is too long."""
     headroom: float | None
-    """1 - expected loop delay / margin; with prediction, 1 - mismatch / distance to that end of the window. The least
-    of all vehicles; None without a margin."""
+    """1 - expected loop delay / margin; with prediction, 1 - mismatch / largest tolerated mismatch of its sign. The
+    least of all vehicles; None without a margin."""
     loop_delay_s_p99: float
     """The 99th percentile of the loop delay over the slowest links, at the worst phase of the ticks."""
     headroom_p99: float | None
