@@ -91,7 +91,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
 
     A rate sets the control rate, and the telemetry rate too if the two were equal; rates on board scale in proportion.
     Jitter keeps the distribution of a link that has one; on other links it is uniform within ± the value. Losses are
-    independent and replace bursts. Raises InputError for jitter in place of measured delays, which have no scale.
+    independent and replace bursts. Raises InputError for jitter on a link with a trace of delays, which has no scale.
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])

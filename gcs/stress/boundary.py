@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where it breaks in flight, where by prediction, and where it provably cannot."""
+"""The map of a campaign with two axes: where the formation breaks, in flight and by prediction, and provably cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -90,10 +90,7 @@ def trials_of(folder: Path) -> Store[Outcome]:
 
 
 def check_study(flag: str, file: Path, kind: str = "campaign", scenario: Scenario | None = None) -> None:
-    """Refuse a folder without the file of a kind of study, or with a study of another scenario or code.
-
-    Raises InputError, which says what was read and what was wanted, if it does not.
-    """
+    """Raise InputError unless the folder of `file` holds this kind of study, of this scenario and its code."""
     for name in (SCENARIO_FILE, file.name):
         if not file.with_name(name).is_file():
             raise InputError(f"{flag}: read no {name} in {file.parent}, wanted the folder of a {kind}")
@@ -109,7 +106,7 @@ def check_study(flag: str, file: Path, kind: str = "campaign", scenario: Scenari
 def run_campaign(
     trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] = lambda _: None
 ) -> list[Outcome]:
-    """Return the outcomes of trials in the given order; those not stored, or with an error, are flown, each once.
+    """Return the outcomes of trials in the given order; those not stored, or stored with an error, are flown first.
 
     `ended` is called after each trial with the number left. Raises KeyboardInterrupt also if Ctrl-C ended a flight in
     real time; that flight is not stored.
@@ -147,7 +144,7 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
     """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
 
     Its runs are left in `flights` beside the campaign's table. A study in real time flies it over UDP, even if it was
-    first flown in virtual time. Raises InputError unless exactly one id begins with `wanted`, and if the trial was
+    first flown in virtual time. Raises InputError unless exactly one id begins with `wanted`, or if the trial was
     flown with another scenario.
     """
     from gcs.views.observer import recover_run  # slow to import, and workers need none of it

@@ -111,9 +111,9 @@ def find_disturbance_onsets(
 ) -> DisturbanceResult:
     """Fly the worst disturbances at sizes around their stability radii, and locate the onset of each.
 
-    Each of `counts` disturbs the first so many vehicles: by default leader and one follower, and all. As shares of the
-    radius, `tolerance` is half the range of sizes in a round, and `allowed` bounds the distance of an onset from the
-    radius and its standard error. Calls `ended` after each flight. Raises InputError if the loop has no such radii.
+    For each of `counts`, that many vehicles are disturbed, the leader first: by default two, and all. As shares of the
+    radius, `tolerance` is half the range of sizes in a round, and `allowed` bounds the standard error of an onset and
+    its distance from the radius. Calls `ended` after each flight. Raises InputError if the loop has no such radii.
     """
     probes, delay_s = _probes(plan)
     onsets = tuple(
@@ -128,7 +128,7 @@ def find_disturbance_onsets(
 
 
 def missed(onsets: Sequence[DisturbanceOnset], allowed: float) -> str | None:
-    """How many onsets with a radius are not measured, too far from it, or too rough to tell; None if none is."""
+    """How many onsets with a radius are not measured, too far from it, or too uncertain; None if none is."""
     unknown = [o for o in onsets if o.difference is None and o.radius_1_s is not None]
     off = [o for o in onsets if o.difference is not None and abs(o.difference) > allowed]
     rough = [o for o in onsets if o not in off and (o.error_1_s or 0.0) > allowed * (o.radius_1_s or inf)]
@@ -247,10 +247,7 @@ def _onset(
 
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> tuple[list[GrowthPoint], bool]:
-    """The growth measured in one flight with a disturbance of a size, and whether the flight stayed linear.
-
-    The first is empty if nothing was measured.
-    """
+    """The growth in one flight with a disturbance of a size, empty if not measured, and whether it stayed linear."""
     flight, ids = fly_plan(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)

@@ -14,7 +14,7 @@ and growth could be read only after a long time. A probe removes everything that
 * Changes of the nominal velocity, sensor noise, the failsafe, which lossy links would trigger, and the limit on the
   spacing error, because a growing error must be observed for long enough to be measured.
 * The vehicles' limits: a clipped response is not linear, and random links push vehicles by more than an error of a
-  millimetre. `past_limits` tells when. Autopilots keep their limits; only the part far from them is used.
+  millimetre. `past_limits` tells whether they do. Autopilots keep their limits; only the part far from them is used.
 * With autopilots, the offsets between local frames (up to 5 mm each), clocks that jump, and the start from rest: the
   formation hovers in place, where the loop is the same as at any velocity.
 
@@ -87,7 +87,7 @@ class FreeResponse:
 def response_alone(
     plan: FlightPlan, scenario: Scenario, system_ids: tuple[int, ...], *, real_time: bool, folder: Path | None
 ) -> FreeResponse:
-    """Fly a probe's scenario, see `probe_scenario`."""
+    """Fly a probe's scenario (see `probe_scenario`); returns the errors of the vehicles `system_ids`."""
     probe = replace(plan, scenario=scenario)
     # if loop delays differ between commands, the loop responds to their mean, which only the truth gives exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)

@@ -69,8 +69,8 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 def _needs_pair(trial: Trial) -> bool:
     """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays.
 
-    It does on links that vary. It also does if vehicles have different links, and either share a loop or the probed
-    vehicle's link is the one that the campaign varies.
+    It takes two on links that vary. It also takes two if vehicles have different links, and either share a loop or the
+    probed vehicle's link is the one that the campaign varies.
     """
     if trial.real_time or not has_constant_links(trial.scenario):
         return not trial.real_time

@@ -188,8 +188,8 @@ def result_of(
 def growth_before(onset: Onset, probes: Iterable[Outcome], *, begins_s: float) -> str:
     """The probe in which errors grow most, although its loop delay is between `begins_s` and the onset; "" if none.
 
-    Growth counts beyond three standard errors of its own and of the onset, and a hundredth of the range of the rates
-    from which the onset is known.
+    Growth counts only if it exceeds three standard errors, its own and the onset's, and a hundredth of the range of the
+    rates from which the onset was located.
     """
     near = [own.growth_1_s for own in onset.flights if own.growth_1_s is not None]
     spread, late_s = float(np.ptp(near)) if near else 0.0, onset.loop_delay_s + onset.error_s

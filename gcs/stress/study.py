@@ -63,7 +63,7 @@ class Study:
         )
 
     def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:
-        """The trials of a sweep (one axis) or map (two), with `seeds` successive seeds from the scenario's on.
+        """The trials of a sweep (one axis) or map (two), with `seeds` successive seeds, beginning with the scenario's.
 
         Every point gets a probe and an own trial. In real time on random links it gets only the own trial: no two
         flights have the same delays, so there is no free response to probe.
@@ -83,12 +83,12 @@ _Flights = tuple[Annotated[Outcome, PlainSerializer(lambda outcome: outcome.id)]
 class Onset:
     """Where the formation breaks, in flight and in the models.
 
-    All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
-    down, that causes this loop delay and is shorter by `waiting_s`, the median of the flights; `link_delay_range_s` is
-    that by their longest and their shortest wait, and `waits_for` says in words what they wait for. `predicted_s` is
-    the sampled margin of the design, or with prediction the end of its mismatch window. `difference` is `loop_delay_s`
-    / `predicted_s` − 1. `predicted_continuous_s` is the same for the continuous model, less half a period for the hold.
-    None where there is no model: of a law that is not linear, or of dynamics of one's own.
+    Delays are loop delays of the vehicle that breaks first. Only `link_delay_s` is a link delay, up plus down: the loop
+    delay minus `waiting_s`, the median wait of the flights. `link_delay_range_s` holds the link delays by their longest
+    and their shortest wait; `waits_for` says in words what datagrams wait for. `predicted_s` is the sampled margin of
+    the design or, with prediction, the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
+    `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. The predictions are
+    None without a linear model: for a nonlinear law, or for the user's own dynamics.
 
     `loop` lists the vehicles of the loop that breaks. `vehicle` is the one whose link alone was slowed: all delays are
     then its own, and `link_delay_left_s` is how much longer its link delay may be than in the scenario. Both are None
@@ -136,8 +136,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. Flights that scatter, as over random
     links, are spread farther until the standard error is a quarter of their range. The search follows the measured
-    growth; the prediction only gives its start. Without a prediction, flights give it (`bracketed`). `shorter` looks
-    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. If
+    growth; the prediction only gives its start. Without a prediction, flights give the start (`bracketed`). `shorter`
+    looks for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. If
     `vehicle` is given, its link alone is slowed, else all links alike. Raises NoOnset with the reason.
     """
     slowed = _Slowed(study, vehicle)

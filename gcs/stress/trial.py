@@ -65,7 +65,7 @@ class Outcome:
     A probe without a growth rate is "aborted" if its flight was, else "unknown", even if its errors broke a limit.
     `probed` is the first vehicle of the measured loop. That loop stands in for the loop of vehicle `critical`, with the
     same wait for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
-    (see `gains.sampled.multirate`; on constant links all are equal); for an own trial it is the measured median.
+    (see `gains.sampled.multirate`; on constant links every command has it); for an own trial it is the measured median.
     `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
     models' growth rates at `loop_delay_s`. The growth of an own trial is that of the envelope of all spacing errors, a
     rough figure. `ticks_sha256` is the hash of the tick log in virtual time; it is the same in any process.
