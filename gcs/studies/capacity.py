@@ -99,8 +99,8 @@ def capacity(
 ) -> list[Capacity]:
     """Find the capacity at each rate, up to `most` vehicles: double the size until one fails, then bisect.
 
-    Each formation flies with `seeds` successive seeds from the scenario's on. Flights last `seconds`, a long time
-    because errors decay slowly near the margin. Those in `store` are not flown again; the others are added to it.
+    Each formation flies with `seeds` successive seeds, beginning with the scenario's. Flights last `seconds`, a long
+    time because errors decay slowly near the margin. Those in `store` are not flown again; the others are added to it.
     `ended` is called after each formation with the maximum number left. Raises InputError if `unflyable`.
     """
     if fault := unflyable(scenario, most, seconds):
@@ -137,7 +137,7 @@ def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | 
 
 
 def formations_at_most(rates: int, most: int) -> int:
-    """The maximum number of formations that a study of so many rates flies, up to `most` vehicles."""
+    """The maximum number of formations that a study of this many rates flies, of up to `most` vehicles each."""
     return rates * _at_most(FEWEST - 1, FEWEST, None, most)
 
 

@@ -1,10 +1,10 @@
 """`gcs design --front` and `--at`: the best gains at a loop delay, by every route, with and without prediction.
 
-`--compare-prediction`: how much more loop delay prediction allows. Slow gains take a long delay, so delays are compared
-at equal decay, that of the scenario's gains with prediction. Without prediction it is the longest delay at which any
-static gains decay as fast. With prediction it is the longest that can be assumed and leaves the loop stable at every
-constant delay within a share of it, with any gains that decay as fast (only the scenario's own if vehicles respond with
-a lag). The string peak of the static gains is no smaller; with a response it is larger.
+`--compare-prediction`: how much more loop delay prediction allows. Slow gains tolerate a long delay, so delays are
+compared at equal decay, that of the scenario's gains with prediction. Without prediction, the delay is the longest at
+which some static gains decay that fast. With prediction, it is the longest assumed delay at which some gains that decay
+that fast (if vehicles respond with a lag, only the scenario's own) keep the loop stable at every constant delay within
+a share of it. The static gains have the same string peak as these; if vehicles respond with a lag, a larger one.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,9 +72,10 @@ def front(
     workers: int = 1,
     ended: Callable[[int], None] = lambda _: None,
 ) -> FrontFields:
-    """The front at these delays (s), by `workers` processes; `ended` is called after each point with the number left.
+    """The gains of largest alpha and of fastest decay at each delay (s), by each method, with and without prediction.
 
-    Raises InputError where a front is not defined.
+    `workers` processes search; `ended` is called after each point with the number left. Raises InputError where a front
+    is not defined.
     """
     search, routes = searched_in(scenario, methods), [Route(*each) for each in product(methods, (False, True), AIMS)]
     left, found = len(routes) * len(delays_s), list[FrontPoint | Refusal]()
@@ -121,7 +122,7 @@ def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
 def point_at(
     scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
 ) -> tuple[Scenario, GainsAtDelay]:
-    """The scenario with the gains of a point of the front, predicted or not: with `prediction` None, the better.
+    """The scenario with the gains of a point of the front; `prediction` None takes the better of on and off.
 
     Raises InputError if no gains take the delay.
     """
@@ -164,7 +165,7 @@ class Comparison(Published):
 
 
 def compared(design: Design, name: str) -> Comparison:
-    """The comparison at the decay of a design. Raises InputError unless it is by inclusion and its gains are stable."""
+    """Compare prediction with none at a design's decay. InputError unless the design is by inclusion and stable."""
     answers = set(design.responses.values())
     if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"

@@ -1,4 +1,4 @@
-"""The source's figures and their flights: flown by our station, except chapter 5, which uses the nonlinear model."""
+"""The source's figures and their flights: flown by our station; those of chapter 5 use the nonlinear model."""
 
 from functools import cache
 from pathlib import Path
