@@ -15,7 +15,7 @@ from gcs.views.page import rendered
 from gcs.views.report import flight_lines
 from gcs.views.scene import MODE_COLORS
 from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
-from gcs.views.table import at_once
+from gcs.views.table import merged
 from scenarios.schema import Scenario
 
 REPORT_FILE = "report.html"
@@ -56,7 +56,7 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
     labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
     modes = _mode_bars(flown, labels)
     shown = {name for _, bar in modes for name, _, _ in bar}
-    said = at_once(event for event in events if event.time_s >= 0.0)
+    said = merged(event for event in events if event.time_s >= 0.0)
     colours = [COLOURS[named.index(k) % len(COLOURS)] if k in named else OTHERS for k in range(len(labels))]
     return rendered(
         _TEMPLATE,

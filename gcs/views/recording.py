@@ -28,7 +28,7 @@ from gcs.plan.formation import plan_formation
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views import scene
 from gcs.views.scene import Color
-from gcs.views.table import at_once, event_text
+from gcs.views.table import event_text, merged
 from scenarios.schema import Scenario
 
 TIMELINE = "sim_time"
@@ -105,7 +105,7 @@ class Recording:
         self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
-        if said := at_once(self._events):
+        if said := merged(self._events):
             times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
             texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
             levels = [_event_level(event) for event, _ in said]

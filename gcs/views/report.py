@@ -81,7 +81,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
     if design.criteria is not None:
         _print_criteria(design.criteria, console)
     if design.trade_off:
-        title = "the trade-off it sits on" if not design.responses else "the trade-off of vehicles that respond at once"
+        title = "the trade-off" if not design.responses else "the trade-off of vehicles that respond at once"
         console.print(table_of(design.trade_off, _TRADE_OFF_COLUMNS, title=title))
 
 

@@ -259,7 +259,7 @@ def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
     return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{number_text(time_s, form)} s"
 
 
-def at_once(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
+def merged(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
     """Events with the vehicles that each is about; consecutive events equal in time, kind and text are merged."""
     same = groupby(events, key=lambda event: (event.time_s, event.kind, event.text))
     groups = [list(group) for _, group in same]
@@ -284,7 +284,7 @@ class Display:
 
     def events(self, events: list[Event]) -> None:
         """Print each event once, unless the live table shows it."""
-        for event, system_ids in at_once(events) if self._says_lines else ():
+        for event, system_ids in merged(events) if self._says_lines else ():
             print(event_text(event, system_ids, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:

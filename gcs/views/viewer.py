@@ -78,9 +78,9 @@ def viewer_url(host: str, port: int) -> str:
     return f"rerun+http://{host}:{port}/proxy"
 
 
-def _refuse_without_screen(way_on: str) -> None:
+def _refuse_without_screen(advice: str) -> None:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError(f"no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; {way_on}")
+        raise InputError(f"no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; {advice}")
 
 
 def _free_port() -> int:
