@@ -97,7 +97,7 @@ def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path
 
 
 def checked(scenario: Scenario, file: Path) -> Scenario:
-    """Returns a changed scenario if its keys do not contradict each other; else ScenarioError names the file."""
+    """The same scenario; raises ScenarioError, which names the file, if its keys contradict each other."""
     for key, read, wanted in _contradictions(scenario):
         raise ScenarioError(file, key, read, wanted)
     return scenario

@@ -1,4 +1,4 @@
-"""The first call of a kernel, for `scenarios/kernel.py`: how Numba caches it, and that no signal breaks into it."""
+"""What `scenarios/kernel.py` changes in Numba: how kernels are cached, and that signals wait for a compilation."""
 
 import signal
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 
 class AnyClone(UserProvidedCacheLocator):
-    """Numba's cache in a folder that its user names, but the same for copies of the source in other folders."""
+    """Places Numba's cache in a folder that the caller names, the same for all copies of the source."""
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:  # noqa: ARG003
@@ -19,8 +19,8 @@ class AnyClone(UserProvidedCacheLocator):
 class KernelCache(FunctionCache):
     """Numba's cache for a function, with an index that names the fields of tuples.
 
-    Compiled code knows them by their order, which may have changed since. And no class is looked up that has gone.
-    `before_compiling` is called where the cache has nothing.
+    Compiled code knows them by their order, which may have changed since. The index holds text, not classes, because a
+    class may no longer exist. `before_compiling` is called if the cache has no code for the arguments.
     """
 
     def __init__(self, function: Callable[..., Any], before_compiling: Callable[[], None]) -> None:

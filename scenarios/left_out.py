@@ -20,7 +20,7 @@ def without(scenario: Scenario, system_ids: Iterable[int], file: Path) -> Scenar
     """The scenario without these vehicles; `file` is named in errors.
 
     Raises ScenarioError for a vehicle that is not in the scenario, if none is left, or if gains are given block by
-    block, which belong to the whole formation.
+    block, because these belong to the whole formation.
     """
     for system_id in dict.fromkeys(system_ids):
         known = [vehicle.system_id for vehicle in scenario.vehicles]

@@ -80,7 +80,7 @@ def each_link(links: Links) -> Iterator[tuple[str, Link]]:
 
 
 def with_traces(scenario: Scenario, file: Path) -> Scenario:
-    """The scenario with the delays themselves in place of the names of trace files, complete without the files."""
+    """The scenario with delays in place of the names of trace files, so that it is complete without these files."""
     traces: dict[str, tuple[float, ...]] = {}
     for key, link in each_link(scenario.links):
         if link.jitter is not None and (name := link.jitter.trace_file) is not None:

@@ -1,4 +1,4 @@
-"""Contradictions in the further requirements of a design, and in `control.for_link`, which measures their delays."""
+"""Contradictions in `control.criteria` and `control.overlap`, and in `control.for_link`, which measures delays."""
 
 from collections.abc import Iterator
 
@@ -28,7 +28,7 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
     control, criteria = scenario.control, scenario.control.criteria
     given = control.gains is not None or control.blocks
     if control.overlap is not None and (control.method == "inclusion" or given):
-        wanted = "no such key, unless method is graph-lqr or graph-dk, designed"
+        wanted = "no such key, unless method is graph-lqr or graph-dk, with gains designed"
         yield "control.overlap", control.overlap.model_dump(), wanted
     if criteria is None:
         return
@@ -51,7 +51,7 @@ def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
         if value := getattr(criteria, name):
             yield f"control.criteria.{name}", value, "no such key without at_delay_s"
     if criteria.maximise in _AT_DELAY:
-        yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"
+        yield "control.criteria.maximise", criteria.maximise, "a figure that needs no delay, without at_delay_s"
 
 
 def _late_contradictions(scenario: Scenario, criteria: Criteria) -> Iterator[Fault]:

@@ -258,8 +258,8 @@ class Autopilot(Part):
     """A simulated multicopter, with `dynamics = "autopilot"`: how it starts, and how it responds to set-points.
 
     It stands on the ground at its position until it is commanded to take off. The acceleration it aims at is that of
-    the set-point plus `velocity_gain_1_s` times its velocity error; its actual acceleration follows by one of the
-    models of `[response]`, by default a first-order lag.
+    the set-point plus `velocity_gain_1_s` times its velocity error; its actual acceleration follows it by one of
+    the models of `[response]`, by default with a first-order lag.
     """
 
     flavour: Flavour = "ardupilot"

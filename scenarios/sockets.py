@@ -30,8 +30,8 @@ _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _EAGAIN, _REFUSED = errno.EAGAIN, errno.ECONNREFUSED
 _DONTWAIT, _REALTIME, _MONOTONIC, _IPV4 = 0x40, 0, 1, 2
 _NAME, _VECTOR, _CONTROL, _CLOCK, _EMPTIED, OFFSET, _WORDS = 7, 9, 11, 19, 21, 22, 23
-"""Where the parts of the array begin, and its length. Last come the time at which all sockets were last empty and the
-offset from the monotonic clock to ns since 1970, when they were last read."""
+"""Where the parts of the array begin, and its length. The last two words are the time at which all sockets were last
+empty and, from the last read, the offset from the monotonic clock to ns since 1970."""
 _NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
 _48_BITS, _LONGEST_NS = 0xFFFFFFFFFFFF, 2**63 - 1
 
@@ -94,7 +94,7 @@ def stamped(own: socket.socket) -> socket.socket:
 
 
 class Buffers(NamedTuple):
-    """The arrays into which kernels read: a `Batch` is made of the first columns of `table`; then the words."""
+    """The arrays into which kernels read, and the words. A `Batch` copies the filled part of `stream` and `table`."""
 
     stream: Bytes
     table: Ints

@@ -56,7 +56,7 @@ def test_a_scenario_is_designed_for_its_delay() -> None:
     ("keys", "fault"),
     [
         ("[control.criteria]\nalpha_at_delay = 0.5", "no such key without at_delay_s"),
-        ('[control.criteria]\nmaximise = "alpha_at_delay"', "what needs no delay"),
+        ('[control.criteria]\nmaximise = "alpha_at_delay"', "a figure that needs no delay"),
         ("[control.criteria]\ndelays_s = [0.2, 0.1]", "the smaller delay first"),
         ("[control.criteria]\ndelay_rate = 0.5", "no such key without delays_s"),
         ("[control.overlap]\nahead = 2", "unless method is graph-lqr"),
