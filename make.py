@@ -20,7 +20,7 @@ LOCK = ROOT / "requirements.lock"
 
 # name: (what it is for, the commands; further arguments go to the last one)
 JOBS: dict[str, tuple[str, list[str]]] = {
-    "setup": ("make .venv with everything in requirements.lock, compile what flies", ["python --version"]),
+    "setup": ("make .venv with everything in requirements.lock, compile the kernels", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
     "test": ("run the tests", ["python -m pytest -n auto"]),
     "soak": (
@@ -32,7 +32,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/clients/test_clients.py"],
     ),
     "peers": (
-        "do the same work with other people's tools, which it installs, and print ratios: gcs bench --peers",
+        "compare with other people's tools, which it installs, and print ratios: gcs bench --peers",
         ["uv pip install --quiet --group peers", "gcs bench scenarios/triangle5.toml --peers"],
     ),
     "lint": (
@@ -41,15 +41,15 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
     "pictures": (
-        "make the pictures in README and docs anew, from flights and designs",
+        "make the pictures in README and docs again, from flights and designs",
         ["python -m docs.generate.pictures"],
     ),
     "reference": (
-        "write the generated reference and the scenarios' JSON Schema anew, from the code (--check: only compare)",
+        "rewrite the generated reference and the scenarios' JSON Schema, from the code (--check: only compare)",
         ["python -m docs.generate reference"],
     ),
     "measurements": (
-        "measure the figures in README and docs anew: NAMEs or all, --timed: only those in real time; --check: compare",
+        "measure the figures in README and docs again: NAMEs or all; --timed: those in real time; --check: compare",
         ["python -m docs.generate measurements"],
     ),
     "docs": (
@@ -57,7 +57,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         ["uv pip install --quiet --group docs", "mkdocs build --strict"],
     ),
     "lock": (
-        "write requirements.lock anew from pyproject.toml",
+        "rewrite requirements.lock from pyproject.toml",
         [
             "uv pip compile --upgrade --universal --generate-hashes --no-header --no-emit-index-url "
             "--all-extras --group dev pyproject.toml -o requirements.lock"
@@ -79,7 +79,7 @@ def install() -> None:
     print("installing the locked packages (half a minute the first time)", flush=True)
     pip = [str(python), "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
     locked = ["--require-hashes", "-r", str(LOCK)]
-    if not _installed_by_uv(python, pip, locked):  # it does not read the settings of pip, such as its index
+    if not _installed_by_uv(python, pip, locked):  # uv does not read the settings of pip, such as its index
         print("uv could not install them, pip tries", flush=True)
         subprocess.run([*pip, *locked], check=True)
     subprocess.run([*pip, "--no-deps", "--no-build-isolation", "--editable", str(ROOT)], check=True)
@@ -87,14 +87,14 @@ def install() -> None:
 
 
 def compile_kernels() -> None:
-    """Compile what runs for every frame, which the first flight would do otherwise."""
+    """Compile what runs for every frame; otherwise the first flight would."""
     print("compiling what runs for every frame (one or two minutes; kept in ~/.cache/formation-gcs)", flush=True)
     flight = [str(VENV / "bin" / "gcs"), "bench", "chain3", "--seconds", "1", "--repeat", "1"]
     subprocess.run(flight, check=True, stdout=subprocess.DEVNULL, cwd=VENV)
 
 
 def _installed_by_uv(python: Path, pip: list[str], locked: list[str]) -> bool:
-    """Whether uv could be installed, and has installed what is locked: in half of pip's time."""
+    """Try to install uv and, with it, the locked packages, in half of pip's time; whether that worked."""
     pinned = re.search(r"^uv==.*(\n +--hash.*)+", LOCK.read_text(), re.MULTILINE)
     own = [*pip, "--require-hashes", "-r", "/dev/stdin"]
     if pinned is None or subprocess.run(own, input=pinned[0], text=True, check=False).returncode != 0:
@@ -111,7 +111,7 @@ def main() -> None:
     for name, (text, _) in JOBS.items():
         jobs.add_parser(name, help=text)
     chosen, further = parser.parse_known_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else every command would compile what it imports anew
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # otherwise every command would compile its imports again
     try:
         with Path(__file__).open() as own:
             fcntl.flock(own, fcntl.LOCK_EX)  # of several jobs at once, the first installs

@@ -1,4 +1,4 @@
-"""Fly one formation over ever longer links, and draw how its errors die away, or do not.
+"""Fly one formation over links of growing delay, and draw how its errors die away or grow.
 
     python examples/delay_sweep.py [PICTURE.png]
 

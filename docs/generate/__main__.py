@@ -14,9 +14,11 @@ def main() -> int:
     described.add_argument("--check", action="store_true", help="write nothing; exit 1 if something would change")
     measured = jobs.add_parser("measurements", help="the figures, from the commands behind them")
     measured.add_argument("names", nargs="*", metavar="NAME", help="these only: " + ", ".join(FIGURES))
-    measured.add_argument("--timed", action="store_true", help="those that are not exact; on an idle machine")
+    measured.add_argument("--timed", action="store_true", help="only those in real time; on an idle machine")
     measured.add_argument(
-        "--check", action="store_true", help="only compare exact ones: all that the tests do not compare"
+        "--check",
+        action="store_true",
+        help="only compare exact ones: NAMEs, or those of less than a minute that no test compares",
     )
     chosen = parser.parse_args()
     if chosen.job == "reference":

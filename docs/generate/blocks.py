@@ -1,4 +1,4 @@
-"""Generated blocks in Markdown pages: where they are, what they hold, and filling them in."""
+"""Finds the generated blocks in Markdown pages, reads them and fills them in."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 _BLOCK = re.compile(r"(?P<begin><!-- generated: (?P<name>[\w-]+) -->\n)(?P<body>.*?)(?P<end><!-- end -->)", re.DOTALL)
 MEASURED_ON = "Measured on "
-"""How the line begins that names machine and date: it alone may differ between two measurements of an exact figure."""
+"""Begins the line with machine and date, the only one that may differ between measurements of an exact figure."""
 
 
 def pages() -> list[Path]:
@@ -28,7 +28,7 @@ def pages_with(name: str) -> list[Path]:
 
 
 def fill(contents: Mapping[str, str]) -> list[Path]:
-    """Write the blocks of these names into every page that holds them; the pages that changed."""
+    """Write the blocks of these names into every page that has them; return the pages that changed."""
     changed: list[Path] = []
 
     def filled(found: re.Match[str]) -> str:
@@ -45,7 +45,7 @@ def fill(contents: Mapping[str, str]) -> list[Path]:
 
 
 def differing(name: str, text: str) -> list[Path]:
-    """The pages whose block of this name says something other than `text`, machine and date aside."""
+    """The pages whose block of this name differs from `text`, apart from machine and date."""
     return [page for page in pages_with(name) if _compared(blocks_of(page)[name]) != _compared(text)]
 
 

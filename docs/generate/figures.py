@@ -1,4 +1,4 @@
-"""What the figures of the documentation are, and the commands that they come from.
+"""The figures of the documentation, from the commands that give them.
 
 Each function runs commands and returns Markdown. Figures that differ from run to run are printed as ranges.
 `docs.generate.measurements` lists the functions and says when their figures are compared.
@@ -18,7 +18,7 @@ from docs.generate.sessions import steps_of
 
 
 def _output(text: str) -> str:
-    """What a command prints, as code."""
+    """The output of a command as a code block, without empty lines."""
     lines = [line.rstrip() for line in text.strip().splitlines()]
     return "\n".join(["```text", *(line for line in lines if line), "```"])
 
@@ -28,14 +28,14 @@ def _ms(seconds: float | None, digits: int = 1) -> str:
 
 
 def _range(values: Iterable[float], form: str = ".1f", unit: str = "") -> str:
-    """The least and the largest of several runs."""
+    """The least and the largest of several values as text, or their common value."""
     known = list(values)
     least, most = format(min(known), form), format(max(known), form)
     return f"{least}{unit}" if least == most else f"{least} to {most}{unit}"
 
 
 def _changed(runner: Runner, scenario: str, name: str, pattern: str, by: str) -> str:
-    """The file of a copy of a scenario with the one line changed that fits the pattern."""
+    """The name of a copy of a scenario in which the only match of the pattern is replaced."""
     text = (ROOT / "scenarios" / f"{scenario}.toml").read_text(encoding="utf-8")
     changed, count = re.subn(pattern, by, text, flags=re.MULTILINE)
     assert count == 1, (scenario, pattern)
@@ -109,7 +109,7 @@ def margin_thesis(runner: Runner) -> str:
 
 
 def prediction_windows(runner: Runner) -> str:
-    """Between which loop delays triangle5 is stable, over several assumed ones."""
+    """The loop delays between which triangle5 is stable, for several assumed ones."""
 
     def span(ends_s: tuple[float, float | None]) -> str:
         return f"{1e3 * ends_s[0]:.1f} to {_ms(ends_s[1])}"
@@ -151,7 +151,7 @@ def prediction_price(runner: Runner) -> str:
 
 
 def prediction_flights(runner: Runner) -> str:
-    """triangle5 over links that take five times its margin, with and without prediction."""
+    """triangle5 over links whose loop delay is five times its margin, with and without prediction."""
     rows: list[tuple[str, ...]] = []
     for name, prediction in (("predicted", '"measured"'), ("plain", '"off"')):
         text = (runner.folder / _predicting(runner, name, prediction)).read_text(encoding="utf-8")
@@ -199,7 +199,7 @@ _ONSETS = {
 
 
 def onsets(runner: Runner) -> str:
-    """Where flights of several formations break, beside the margins of their designs."""
+    """Onsets in flight of several formations, beside the margins of their designs."""
     rows: list[tuple[str, ...]] = []
     for name, options in _ONSETS.items():
         result = _onset(runner, name.split()[0], options)

@@ -36,7 +36,7 @@ Node = dict[str, Any]
 
 
 def schema() -> Node:
-    """The JSON Schema of a scenario file, as TOML can say it: a key that may be omitted has no null."""
+    """The JSON Schema of a scenario file. TOML has no null, so neither has a key that may be omitted."""
     made = Scenario.model_json_schema()
     for kind in _parts(Part):
         found = made if kind is Scenario else made["$defs"].get(kind.__name__, {})
@@ -91,7 +91,7 @@ def _is_empty(default: Any) -> bool:
 
 
 def keys_page() -> str:
-    """A section for the scenario and one for each kind of table in it, which may stand in several places."""
+    """A section for the scenario and one for each kind of table in it, which may occur in several places."""
     whole = schema()
     places: dict[str, list[str]] = {"": ["The scenario"]}
     _find_places(whole, whole, "", places)
@@ -99,7 +99,7 @@ def keys_page() -> str:
 
 
 def _find_places(whole: Node, part: Node, name: str, places: dict[str, list[str]]) -> None:
-    """The headers under which each kind of table stands, in the order of the keys."""
+    """Collect the headers of each kind of table, in the order of the keys."""
     for key, given in part["properties"].items():
         kind, what = _kind(given)
         if kind:
@@ -121,7 +121,7 @@ def _section(whole: Node, part: Node, headers: list[str]) -> str:
 
 
 def _paragraphs(text: str) -> str:
-    """A docstring as Markdown: what is laid out in columns stays so."""
+    """A docstring as Markdown; text laid out in columns becomes a code block."""
     return "\n\n".join(
         f"```text\n{paragraph}\n```" if re.search(r"\S {2,}\S", paragraph) else paragraph
         for paragraph in text.split("\n\n")
@@ -176,7 +176,7 @@ _PATTERNS = {
     r"^jsbsim(:[A-Za-z0-9_-]+)?$": "jsbsim or jsbsim:MODEL",
     r"^[0-9a-f]{64}$": "64 hexadecimal digits",
 }
-"""What a pattern of the schema asks for."""
+"""Each pattern of the schema, in words."""
 
 
 def _bounds(node: Node, what: str) -> str:

@@ -1,4 +1,4 @@
-"""Every block of figures; measures them anew, or says which differ from what is committed."""
+"""Lists every block of figures; measures them again, or reports which differ from what is committed."""
 
 import sys
 from collections.abc import Callable, Iterable
@@ -38,7 +38,7 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     ),
     "slow": (
         *(figures.onsets, figures.one_link, figures.maps, figures.capacity, figures.copters_onset),
-        *(figures.onset_chain3, figures.prediction_flights, figures.thesis_flights),  # tests fly the like
+        *(figures.onset_chain3, figures.prediction_flights, figures.thesis_flights),  # tests make similar flights
     ),
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
@@ -48,14 +48,14 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
 }
 
 FIGURES = {make.__name__.replace("_", "-"): Figure(make, kind) for kind, makers in _MAKERS.items() for make in makers}
-"""Every block, by its name in the pages: that of its function."""
+"""Every block by its name in the pages, which is that of its function with hyphens."""
 
 _EXACT = "Exact: computed, or flown in virtual time, and the same on every machine to the digits printed."
 _VARIES = "Measured in real time: it differs from run to run and from machine to machine."
 
 
 def measured(name: str) -> dict[str, str]:
-    """The blocks of a figure: with its commands, machine and date, and `NAME-bare` without."""
+    """Both blocks of a figure: `NAME` with commands, machine and date, and `NAME-bare` without."""
     figure = FIGURES[name]
     with runner() as run:
         text = figure.make(run)
@@ -65,7 +65,7 @@ def measured(name: str) -> dict[str, str]:
 
 
 def measure(names: Iterable[str]) -> int:
-    """Measure these and write them into the pages, each as soon as it is known; the number that failed."""
+    """Measure these and write each into its pages at once; return how many failed."""
     failed = 0
     for name in names:
         print(f"{name} ...", flush=True)
@@ -80,7 +80,7 @@ def measure(names: Iterable[str]) -> int:
 
 
 def stale(names: Iterable[str]) -> list[str]:
-    """Which of these figures the commands no longer give, with the pages that say otherwise."""
+    """For each figure that its commands no longer give: the page, the block and what they give now."""
     found: list[str] = []
     for name in names:
         for block, text in measured(name).items():

@@ -1,4 +1,4 @@
-"""Make the pictures in README and docs anew, by the commands that a user has; some minutes.
+"""Make the pictures in README and docs again, with the commands of a user; takes some minutes.
 
     python3 make.py pictures
 
@@ -19,7 +19,7 @@ SCENARIOS = ROOT / "scenarios"
 
 
 def gcs(*arguments: str | Path) -> None:
-    """Run a command of the ground station; it has to succeed."""
+    """Run a command of the ground station; CalledProcessError if it fails."""
     print("gcs", *arguments, flush=True)
     program = Path(sys.executable).with_name("gcs")
     subprocess.run([program, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)

@@ -1,4 +1,4 @@
-"""What `docs.generate.forked` forks its processes from: a process that has imported the project and flown.
+"""Prepares the process that `docs.generate.forked` forks: it has imported the project and flown.
 
 Importing this module flies for a second, which loads the kernels.
 """

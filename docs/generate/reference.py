@@ -1,4 +1,4 @@
-"""The blocks of the reference, and the schema that editors read: all of them follow from the code.
+"""The blocks of the reference, and the schema that editors read, all generated from the code.
 
 Columns come from the record in the code, JSON fields from `fields.toml`; `keys` and `api` make the other two pages.
 """
@@ -54,14 +54,14 @@ def json_fields(file: str) -> str:
 
 
 def found_fields(value: Any, known: Iterable[str], path: str = "") -> set[str]:
-    """The fields of a JSON value; one that is in `known` is not looked into."""
+    """The paths of the fields of a JSON value, down to those in `known`."""
     if path in set(known):
         return {path}
     if isinstance(value, dict):
         found = (found_fields(inner, known, f"{path}.{name}" if path else name) for name, inner in value.items())
         return set[str]().union(*found)
     if value == [] and any(each.startswith(f"{path}[]") for each in known):
-        return set()  # none of them here
+        return set()  # the list is empty here
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return set[str]().union(*(found_fields(inner, known, f"{path}[]") for inner in value))
     return {path}
@@ -123,7 +123,7 @@ def write() -> list[Path]:
 
 
 def stale() -> list[str]:
-    """What is committed and no longer follows from the code."""
+    """What is committed and differs from what the code gives now."""
     made = blocks.once_each(MAKERS)
     found = [f"{page}: {name}" for name, text in made.items() for page in blocks.differing(name, text)]
     if not keys.SCHEMA_FILE.exists() or keys.SCHEMA_FILE.read_text(encoding="utf-8") != keys.schema_text():

@@ -1,4 +1,4 @@
-"""Runs commands as a reader of the documentation would type them, and remembers which."""
+"""Runs commands as a reader of the documentation would type them, and lists them."""
 
 import contextlib
 import json
@@ -20,7 +20,7 @@ _ENVIRONMENT = {"COLUMNS": "120", "NO_COLOR": "1", "TERM": "dumb"}
 
 
 class CommandError(Exception):
-    """A command behind a figure did not do what it should."""
+    """A command behind a figure had an unwanted exit code or printed no JSON."""
 
 
 class Runner:

@@ -2,7 +2,7 @@
 
     <!-- test: run -->               commands, in virtual time or short
     <!-- test: realtime -->          commands that need sockets and the real clock
-    <!-- test: realtime, server -->  one that runs on while the others are typed in another terminal
+    <!-- test: realtime, server -->  a command that keeps running while the others are typed in another terminal
     <!-- test: run, exit 1 -->       commands with this exit code
     <!-- test: file NAME -->         a file to save
     <!-- test: append NAME -->       what to add at its end
@@ -24,7 +24,7 @@ class Step:
 
     text: str
     file: str = ""
-    """The file that the block is, or is added to."""
+    """The file that the block is saved as or appended to."""
     append: bool = False
     python: bool = False
     realtime: bool = False

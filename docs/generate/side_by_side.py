@@ -1,4 +1,4 @@
-"""The figures that set this station beside other tools, and one worker beside many."""
+"""Figures that compare this station with other tools, and one worker with many."""
 
 from docs.generate.blocks import table
 from docs.generate.runner import Runner
@@ -9,7 +9,7 @@ _CORES, _EFFICIENCY, _MAP = 1000, 0.9, 100_000
 
 
 def peers(runner: Runner) -> str:
-    """A row for each figure of the same work, and the peers that were left out."""
+    """A row for each figure that is compared, and the peers that were skipped."""
     found = runner.json(PEERS)
     rows = [
         (
@@ -26,7 +26,7 @@ def peers(runner: Runner) -> str:
 
 
 def tick_ratio(runner: Runner) -> str:
-    """One ratio that says on any machine how fast the station is."""
+    """A ratio that shows on any machine how fast the station is."""
     found = runner.json("gcs bench scenarios/triangle5.toml --vehicles 250")
     return (
         f"A whole station tick of {found['vehicles']} vehicles takes **{found['tick_over_parse']:.1f} times** as long "

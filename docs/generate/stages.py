@@ -1,7 +1,7 @@
-"""Where the time of a flight in virtual time goes, beside the least that whole arrays would take for the same.
+"""The time of each stage of a flight in virtual time, beside the least that whole arrays would take for the same.
 
-`python -m docs.generate.stages` flies 250 vehicles and asks a thousand times a second which module
-runs. The floor is measured with arrays over all vehicles that do only the arithmetic: no vehicle has an object.
+`python -m docs.generate.stages` flies 250 vehicles and samples the running module a thousand times a second. The
+floor is measured with arrays over all vehicles that do only the arithmetic: no vehicle has an object.
 """
 
 import argparse
@@ -35,12 +35,12 @@ _STAGES = {
     "passing on": ("gcs/", "gains/", "docs/"),
     "vehicles and links": ("sim_vehicles/", "scenarios/"),
 }
-"""Each stage with the modules that it consists of; the first that fits counts. A kernel counts for who calls it."""
+"""The modules of each stage; the first match counts. A kernel counts for the module that calls it."""
 
 
 @dataclass
 class _StepByStep:
-    """Vehicles whose steps kernels cannot do together with the station's."""
+    """Vehicles that are stepped one call at a time, so that no kernel runs their steps together with the station's."""
 
     vehicles: Vehicles
 

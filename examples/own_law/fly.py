@@ -1,8 +1,8 @@
-"""Fly a control law of one's own, and the linear law that it is for small errors.
+"""Fly a user's control law, and the linear law that it equals for small errors.
 
     python examples/own_law/fly.py
 
-The linear one states its matrices, so its delay margin is known; that of the other is found by gcs stress --onset.
+The linear law states its gain matrix, so its delay margin is known; gcs stress --onset finds that of the other.
 """
 
 from pathlib import Path

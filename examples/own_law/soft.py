@@ -1,4 +1,4 @@
-"""A control law of one's own: the leader-follower law of the thesis with commands that saturate smoothly."""
+"""An example of a user's control law: the leader-follower law of the thesis, with smoothly saturated commands."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ MOST_M_S2 = 20.0
 
 
 def law(t_s: float, states: Floats, formation: LawFormation, memory: dict[str, Any]) -> Floats:
-    """The linear law, with each component kept within MOST_M_S2; `memory` counts how often that mattered."""
+    """The linear law, with each component kept within MOST_M_S2; `memory` counts how often a command saturated."""
     wanted = linear(t_s, states, formation, memory)
     memory["saturated"] = memory.get("saturated", 0) + int((np.abs(wanted) > MOST_M_S2).any())
     return MOST_M_S2 * np.tanh(wanted / MOST_M_S2)
@@ -29,6 +29,6 @@ def linear(t_s: float, states: Floats, formation: LawFormation, memory: dict[str
 
 
 def matrices(formation: LawFormation) -> Floats:
-    """K of u = K e, which `linear` is."""
+    """K of the law u = K e that `linear` computes."""
     own, front, spacing = (gain * np.eye(2) for gain in (K1_1_S, K2_1_S, K3_1_S2))
     return formation.model.overlapping_gain(own, front, spacing)

@@ -1,4 +1,4 @@
-"""JSBSim's Cessna 172 in steady flight, without any MAVLink: the time of a step and its length, as JSON in a file."""
+"""JSBSim's Cessna 172 in steady flight, without MAVLink: writes run time and length of a step to a JSON file."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ jsbsim: Any = import_module("jsbsim")  # without types
 aircraft = jsbsim.FGFDMExec(None)
 aircraft.disable_output()
 aircraft.load_model("c172x")
-aircraft.disable_output()  # that of the model, which would be written into this folder
+aircraft.disable_output()  # the model's own output, which would be written into this folder
 aircraft["ic/h-sl-ft"], aircraft["ic/vc-kts"] = 3000.0, 100.0
 aircraft.run_ic()
 for _ in range(SETTLING):

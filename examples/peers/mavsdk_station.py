@@ -1,6 +1,6 @@
 """A plain ground station on MAVSDK, started with the arguments of `plain`.
 
-MAVSDK sends a set-point whenever one is set, as here in each tick, and would repeat it at 20 Hz by itself.
+MAVSDK sends a set-point whenever one is set, here in each tick, and otherwise repeats the last at 20 Hz.
 """
 
 import atexit

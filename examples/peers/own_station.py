@@ -1,6 +1,6 @@
 """This station in real time, without the observer beside it, started with the arguments of `plain`.
 
-It logs and measures what it does in every flight; a plain station does neither.
+It logs and measures as in every flight; a plain station does neither.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""The law and the clockwork of a plain station, whose MAVLink another library speaks; used by the scripts beside it.
+"""The control law and the timing of a plain station; the scripts beside it add MAVLink by another library.
 
 `gcs bench --peers` starts each script with a scenario, a UDP port on loopback and the file for its figures.
 """
@@ -32,7 +32,7 @@ def ordered() -> Order:
 
 
 class Law:
-    """u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p from the newest states as they are, whatever their age."""
+    """u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p from the newest states, whatever their age."""
 
     def __init__(self, scenario: Scenario) -> None:
         formation, gains = plan_formation(scenario), scenario.control.gains
@@ -60,17 +60,17 @@ class Law:
 
 
 def report(out: Path, lateness_s: Sequence[float] | FloatArray, due: int, used_s: float, error_m: float) -> None:
-    """Leave the lateness of the ticks flown, their share of those due, the processor time and the spacing error."""
+    """Write the lateness of the ticks flown, their share of those due, the processor time and the spacing error."""
     p50, p99 = np.percentile(lateness_s, [50, 99]).tolist()
     figures = {"late_p50_s": p50, "late_p99_s": p99, "flown": len(lateness_s) / due, "used_s": used_s}
     out.write_text(json.dumps(figures | {"error_m": error_m}), encoding="utf-8")
 
 
 class Station(Protocol):
-    """The MAVLink of a plain station: another library's."""
+    """The MAVLink part of a plain station, by another library."""
 
     def start(self, telemetry_hz: float) -> None:
-        """Command all until each has armed in GUIDED mode and reports its state."""
+        """Send start commands until every vehicle has armed in GUIDED mode and reports its state."""
         ...
 
     def wait(self, until_ns: int) -> None:
@@ -83,9 +83,9 @@ class Station(Protocol):
 
 
 def fly(station_of: Callable[[Law, int], Station]) -> None:
-    """Fly the scenario's duration with the station of a law and a port, and report.
+    """Fly the scenario for its duration with the station made for a law and a port, and report.
 
-    A tick that is due before the one before it has been sent is skipped.
+    A tick that falls due before the previous one has been sent is skipped.
     """
     order = ordered()
     law = Law(order.scenario)
