@@ -1,4 +1,4 @@
-"""Set up before any test module is loaded."""
+"""Settings that apply before any test module is loaded."""
 
 import os
 from collections import Counter
@@ -7,19 +7,19 @@ import pytest
 from hypothesis import settings
 
 SLOW = os.environ.get("SLOW_TESTS") == "1"
-# no test judges a time: on a busy machine an example may take anything
+# no test judges run time: on a busy machine an example may take any time
 settings.register_profile("untimed", deadline=None, max_examples=100 if SLOW else 50)
 settings.load_profile("untimed")
 
 
 CASES = Counter[str]()
-"""How many cases of each slow test there are so far, in the order of its parameters."""
+"""How many cases of each slow test have been collected so far."""
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
-    """Skip the further cases of slow tests, and let tests on the real clock try up to three times.
+    """Skip all but the first cases of slow tests, and run `realtime` tests up to three times until they pass.
 
-    Neighbours on the machine may hold up any one of the latter.
+    Other processes on the machine may delay any single run.
     """
     if item.get_closest_marker("realtime"):
         item.add_marker(pytest.mark.flaky(reruns=2))

@@ -1,4 +1,4 @@
-"""The script of the page on SITL starts the five vehicles of copters5, each in its place."""
+"""The script of the page on SITL starts the five vehicles of copters5, each at its own home."""
 
 import os
 import subprocess

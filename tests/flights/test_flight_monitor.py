@@ -1,4 +1,4 @@
-"""The monitor in flight, in virtual time: it speaks before the formation suffers, and its action saves the flight.
+"""The monitor in flight, in virtual time: it warns before errors grow, and its actions keep the formation stable.
 
 `MONITOR_SEEDS=200 python3 make.py test tests/flights/test_flight_monitor.py` flies as many seeds; a few are flown by
 default.
@@ -96,7 +96,7 @@ def test_gains_change_without_a_jump_in_command() -> None:
         assert changes.size == 4
         jump = np.abs(np.diff(own["command_north_m_s2"]))
         around = [float(jump[k - 1]) for k in changes]
-        # No greater than what the command does from tick to tick in the second around it.
+        # The step is no larger than the command's steps in the second around it.
         for k, step in zip(changes.tolist(), around, strict=True):
             assert step <= 1.5 * float(np.max(np.delete(jump[k - 25 : k + 25], 24))) + 1e-3
 
@@ -139,7 +139,7 @@ def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
     parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # checksum and layout: theirs
     messages: list[Any] = [message for some in parsed for message in some]
     told = [message for message in messages if message.get_type() == "STATUSTEXT"]
-    # What is decided in the flight's last tick is no longer seen to be sent.
+    # Messages about changes in the flight's last tick are not seen here.
     assert [message.text for message in told] == changes[: len(told)]
     assert len(told) >= len(changes) - len(plan.formation.system_ids)
     assert {m.severity for m in told if m.text.endswith("CRITICAL")} == {dialect.MAV_SEVERITY_CRITICAL}
@@ -148,7 +148,7 @@ def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
 
 @dataclass
 class Unanswering:
-    """Vehicles one of whose TIMESYNC replies are lost: all from a time on, or a share of them."""
+    """Vehicles, one of which loses its TIMESYNC replies from a time on: all of them or a share."""
 
     vehicles: Vehicles
     system_id: int
@@ -169,7 +169,7 @@ class Unanswering:
 
 @pytest.mark.parametrize(("share", "tells"), [(1.0, True), (0.3, False)])
 def test_a_vehicle_that_answers_no_timesync_is_critical(share: float, tells: bool) -> None:
-    """Its loop delay may be any. Lost replies are no sign of it."""
+    """Its loop delay may have any value. Occasional lost replies do not count."""
     plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 40.0}))
     station = Station(plan, start_ns=START_NS)
     vehicles = Unanswering(vehicles_of(plan.scenario), 5, share, START_NS + 12_000_000_000)
@@ -188,7 +188,7 @@ def test_a_vehicle_that_answers_no_timesync_is_critical(share: float, tells: boo
 
 
 def test_a_collision_breaks_the_flight_and_least_distance_is_summarised() -> None:
-    # Vehicles that stand nearer to each other than is allowed, from the flight's first tick on.
+    # From the first tick of the flight on, vehicles are nearer to each other than allowed.
     ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=180.0))
     assert station.end_reason.startswith("broken: vehicles")
     assert "have collided" in station.end_reason

@@ -21,7 +21,7 @@ from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
 GAINS = Control(gains=FixedGains(K1=-3.4079559741115664, K2=0.6308727089934395, K3=5.608081773264997))
-"""Those of 0.3 s with both at 50 Hz."""
+"""Gains with a margin of 0.3 s if both rates are 50 Hz."""
 
 
 def scenario_at(telemetry_hz: float, control_hz: float = 50.0, *, name: str = "chain3", **changes: Any) -> Scenario:
@@ -36,7 +36,7 @@ def scenario_at(telemetry_hz: float, control_hz: float = 50.0, *, name: str = "c
     [(100.0, 0.300000), (50.0, 0.300000), (25.0, 0.290179), (10.0, 0.261117), (5.0, 0.213938)],
 )
 def test_a_flight_has_the_margin_of_its_telemetry_rate(telemetry_hz: float, margin_s: float) -> None:
-    """Margins of the same gains from the newest sample, by the march of events in
+    """The loop delay counts from the newest sample; margins by the event-by-event method of
     `tests/gains/sampled/test_multirate.py`."""
     design, plan = flight_plan(scenario_at(telemetry_hz, control=GAINS))
     assert plan.delay_margin_s == pytest.approx(margin_s, abs=1e-6)
@@ -68,8 +68,8 @@ def test_a_design_has_the_margin_asked_for_at_any_rates(
     [(25.0, 50.0), (10.0, 50.0), (5.0, 50.0), (100.0, 50.0), (50.0, 20.0), (30.0, 50.0), (7.0, 50.0)],
 )
 def test_flown_growth_is_that_of_the_model_at_these_rates(telemetry_hz: float, control_hz: float) -> None:
-    """Near the margin and 8 % beyond: half a per cent of loop delay would be 1e-2. Samples are on whole milliseconds,
-    which at 30 and 7 Hz their period is not."""
+    """At the margin and 8 % beyond it. An error of half a per cent in loop delay would change the growth by 1e-2.
+    Samples are taken at whole milliseconds, although the periods of 30 and 7 Hz are not."""
     _, plan = flight_plan(scenario_at(telemetry_hz, control_hz, control=GAINS))
     for part in (1.0, 1.08):
         link_s = part * plan.delay_margin_s - plan.timing.spread_s - 0.01
@@ -89,7 +89,7 @@ def test_growth_flown_on_board_matches_the_model_at_these_rates(telemetry_hz: fl
 
 
 def test_the_two_onboard_loop_models_agree_where_both_hold() -> None:
-    """Telemetry at a fifth of the control rate: the map from step to step, and that from event to event."""
+    """Telemetry at a fifth of the control rate: the step-to-step map and the event-to-event map."""
     scenario = scenario_at(10.0, name="thesis_delay")
     _, plan = flight_plan(scenario)
     timing = onboard_timing(scenario)
@@ -102,7 +102,7 @@ def test_the_two_onboard_loop_models_agree_where_both_hold() -> None:
 
 
 def test_missing_states_delay_the_loop_and_reused_ones_do_not() -> None:
-    """Telemetry at 10 Hz of a vehicle whose link is gone for half a second: commands from one state, five and more."""
+    """Telemetry at 10 Hz over a link with an outage of half a second: five commands from each state, then more."""
     gone = Link(delay_s=0.02, outages=(Outage(from_s=2.02, until_s=2.52),))
     links = scenario_at(10.0).links.model_copy(update={"up": gone})
     _, plan = flight_plan(scenario_at(10.0, control=GAINS, links=links, duration_s=4.0))
@@ -119,8 +119,8 @@ def test_missing_states_delay_the_loop_and_reused_ones_do_not() -> None:
     assert 0.04 <= known(summary.loop_delay_s.p50) <= 0.06
 
 
-def test_slow_telemetry_far_below_the_margin_is_flown_in_peace() -> None:
-    """100 ms of links at 5 Hz against 214 ms: were every age of a state a loop delay, it would be past the margin."""
+def test_slow_telemetry_far_below_the_margin_raises_no_alarm() -> None:
+    """100 ms of link delay at 5 Hz, margin 214 ms: if every age of a state counted, the margin would be exceeded."""
     scenario = scenario_at(5.0, control=GAINS, duration_s=30.0).with_link_delay(up_s=0.05, down_s=0.05)
     _, plan = flight_plan(scenario)
     flight = fly_plan(plan)

@@ -1,4 +1,4 @@
-"""Hostile datagrams into sockets besides the station's: a mirror's, and those of links before other vehicles."""
+"""Hostile datagrams into sockets other than the station's: a mirror's, and those of `--links-only`."""
 
 import socket
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def other() -> Iterator[socket.socket]:
 
 
 def hostile(rng: np.random.Generator, messages: list[int], source: int) -> list[bytes]:
-    """Some of everything, and a lone magic of each kind."""
+    """Some datagrams of every kind, and the start byte of each MAVLink version alone."""
     frames = extreme(rng, 10, messages, source=source, targets=[0, 1, 2, 255])
     frames += any_message(rng, 5, list(range(256)), set())
     frames += [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]

@@ -55,7 +55,7 @@ def test_datagrams_bear_their_time_of_arrival_not_of_reading(station: socket.soc
         ((_, _, time_ns),) = ports.receive()
         assert time_ns >= before_ns - MS // 10  # the two clocks are compared to some µs
         errors_ns.append(time_ns - after_ns)
-    assert statistics.median(errors_ns) < MS  # a loaded host may stop us between any two lines, but not mostly
+    assert statistics.median(errors_ns) < MS  # a loaded host may stop us between any two lines, but rarely does
 
 
 def test_only_the_station_is_listened_to(station: socket.socket, ports: Ports) -> None:
@@ -68,14 +68,14 @@ def test_only_the_station_is_listened_to(station: socket.socket, ports: Ports) -
     assert [data for _, data, _ in ports.receive()] == [b"station"]
 
 
-def test_it_waits_until_the_instant_and_not_less(ports: Ports) -> None:
+def test_it_waits_until_the_instant_and_never_returns_early(ports: Ports) -> None:
     late_ns: list[int] = []
     for _ in range(20):
         until_ns = time.monotonic_ns() + 3 * MS + MS // 10
         ports.sockets.wait(until_ns)
         late_ns.append(time.monotonic_ns() - until_ns)
     assert min(late_ns) >= 0
-    # The best, because a loaded host puts off most. A time-out rounded up to whole milliseconds is never below 0.9 ms.
+    # The best, because a loaded host delays most. A time-out rounded up to whole milliseconds is never below 0.9 ms.
     assert min(late_ns) < MS // 2
 
 

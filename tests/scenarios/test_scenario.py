@@ -180,8 +180,8 @@ def test_errors_name_the_system_id_and_the_line() -> None:
         parse("\n".join(lines), FILE)
 
 
-def test_every_error_that_the_schema_can_raise_has_words() -> None:
-    """Kinds of the schema's types, as pydantic's own core schema of it names them."""
+def test_every_error_that_the_schema_can_raise_has_a_text() -> None:
+    """The kinds of types in pydantic's core schema of a scenario."""
     kinds = set(re.findall(r"'type': '([a-z-]+)'", repr(Scenario.__pydantic_core_schema__)))
     covered = {"model", "model-fields", "model-field", "default", "nullable", "int", "float", "bool", "str", "tuple"}
     one_fault = {"function-wrap", "function-after", "no-info", "union"}  # a key of two types, and system ids
@@ -274,7 +274,7 @@ def test_bounds_of_requirements_are_those_of_designs() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [-0.1, float("nan"), float("inf")])
-def test_a_link_delay_that_is_none_is_refused(delay_s: float) -> None:
+def test_a_negative_or_non_finite_link_delay_is_refused(delay_s: float) -> None:
     with pytest.raises(ScenarioError, match=r"triangle5: down_s: read .*, wanted a delay in seconds, from 0"):
         load(SCENARIOS / "triangle5.toml").with_link_delay(up_s=0.1, down_s=delay_s)
 
@@ -286,7 +286,7 @@ def test_every_copter_must_have_an_altitude_to_take_off_to() -> None:
         vehicles = tuple(vehicle.model_copy(update={"altitude_m": own_m}) for vehicle in copters.vehicles)
         return checked(copters.model_copy(update={"altitude_m": altitude_m, "vehicles": vehicles}), FILE)
 
-    assert flown_at(0.0, 20.0).altitude_m == 0.0  # no vehicle flies at it
+    assert flown_at(0.0, 20.0).altitude_m == 0.0  # not used: each vehicle has its own
     with pytest.raises(ScenarioError, match=r"vehicles\[0\]\.altitude_m: read 0.0, wanted an altitude above 0"):
         flown_at(20.0, 0.0)
 

@@ -14,7 +14,7 @@ SENT_M_S2, SENT_M_S3 = 2.25, 4.0
 
 
 @pytest.mark.parametrize("start_m", [3.0, 20.0])
-def test_far_vehicle_comes_without_overshoot_nearly_as_fast_as_allowed(start_m: float) -> None:
+def test_far_vehicle_arrives_without_overshoot_nearly_as_fast_as_allowed(start_m: float) -> None:
     scenario = three(duration_s=14.0, **LIMITS, **RESPONSE)
     first, *rest = scenario.vehicles
     places = [(first.position_ne_m[0] - 12.0 * k - start_m, first.position_ne_m[1] + 12.0 * k) for k in (1, 2)]

@@ -1,4 +1,4 @@
-"""Ten minutes with simulated copters whose clocks lie as those of a real ArduCopter in SITL do."""
+"""Ten minutes with simulated copters whose clocks are as wrong as those of a real ArduCopter in SITL."""
 
 from dataclasses import replace
 from functools import cache
@@ -40,7 +40,7 @@ def flown(duration_s: float, **changes: Any) -> Flight:
     return fly(replace(planned()[1], scenario=scenario))
 
 
-def test_lying_clocks_show_no_jump_or_negative_delay() -> None:
+def test_wrong_clocks_show_no_jump_or_negative_delay() -> None:
     flight = flown(600.0)
     assert flight.station.end_reason == "completed: duration reached"
     assert CLOCK_JUMPED not in flight.texts("vehicle")
@@ -51,13 +51,13 @@ def test_lying_clocks_show_no_jump_or_negative_delay() -> None:
     summary = summarise(flight.station.plan.scenario, planned()[0], flight.ticks, flight.events)
     assert summary.loop_delay_bound_s is not None
     assert 0.005 < summary.loop_delay_bound_s < 0.015
-    # 0.3 ms each way, and at most a period of waiting: what is shown misses it by no more than the bound
+    # the true delay: 0.3 ms each way plus at most a period of waiting; the error is within the bound
     known = rows[np.isfinite(rows["loop_delay_s"])]
     assert (known["loop_delay_s"] - known["loop_delay_bound_s"]).max() <= 0.1006
 
 
 @pytest.mark.parametrize("by_s", [-0.25, 0.02])
-def test_a_stalled_simulator_among_lying_clocks_is_a_jump(by_s: float) -> None:
+def test_a_stalled_simulator_among_wrong_clocks_is_a_jump(by_s: float) -> None:
     flight = flown(30.0, clock_jumps=(ClockJump(at_s=60.0, by_s=by_s),))
     assert flight.texts("vehicle").count(CLOCK_JUMPED) == 2
     assert flight.station.end_reason == "completed: duration reached"

@@ -54,7 +54,9 @@ def chosen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, LinkPart
 def test_a_point_of_the_front_decays_in_flight_as_computed(predict: str) -> None:
     delay_s = 0.4
     way = "on" if predict == "on" else "off"
-    scenario, point = point_at(CHAIN, delay_s, "inclusion", "alpha_at_delay", way)  # fastest is a multiple root
+    scenario, point = point_at(
+        CHAIN, delay_s, "inclusion", "alpha_at_delay", way
+    )  # the fastest gains have a multiple root
     plan = flight_plan(scenario.with_calm_monitor())[1]
     assert point.stable_s is not None
     least_s, most_s = point.stable_s
@@ -72,7 +74,7 @@ def test_a_point_of_the_front_decays_in_flight_as_computed(predict: str) -> None
 
 
 def test_the_delay_of_a_log_is_what_the_station_measured(chosen: tuple[Scenario, LinkPart]) -> None:
-    """Within half a period: where telemetry falls between two ticks is drawn, and in a flight it stays."""
+    """Within half a period: the phase of telemetry between two ticks is random, and constant during a flight."""
     part = chosen[1]
     assert part.loop_delay_s_p50 == pytest.approx(logged()[1], abs=PERIOD_S / 2.0)
     assert part.loop_delay_s_least < part.loop_delay_s_p50 < part.loop_delay_s_worst
@@ -98,7 +100,7 @@ def test_what_is_chosen_for_a_link_beats_the_default_there(chosen: tuple[Scenari
 
 
 def test_a_flight_keeps_the_headroom_that_was_asked_for() -> None:
-    """States that come late or get lost make the loop delay longer, but their age is known: no mismatch."""
+    """Late or lost states lengthen the loop delay, but their age is known, so there is no mismatch."""
     link = Link(delay_s=0.2, jitter=Jitter(distribution="uniform", scale_s=0.03), loss_probability=0.05)
     control = Control(for_link="measured", string_peak_max=1.0)
     scenario = CHAIN.model_copy(update={"links": Links(up=link, down=link), "control": control, "duration_s": 20.0})
@@ -112,7 +114,7 @@ def test_a_flight_keeps_the_headroom_that_was_asked_for() -> None:
 
 @pytest.mark.slow(first=0)
 def test_short_delays_get_gains_though_long_ones_allow_none() -> None:
-    """Over the 20 ms of chain3 they are so fast that a prediction over 3 s would tolerate 1 ms."""
+    """Gains for the 20 ms links of chain3 are so fast that a prediction over 3 s would tolerate only 1 ms."""
     flight = fly_virtual(CHAIN.model_copy(update={"control": Control(for_link="measured"), "duration_s": 2.0}))
     assert flight.summary.verdict == "stable"
     assert flight.design.prediction is not None
@@ -165,11 +167,11 @@ def test_links_measured_before_a_flight_have_its_logs_delays() -> None:
     assert before.vehicles == (1, 2, 3)
     flown_s = flown(CHAIN.model_copy(update={"links": links}).with_calm_monitor())[1].loop_delay_s
     assert before.loop_delay_s_p50 == pytest.approx(known(flown_s.p50), abs=PERIOD_S / 2.0)
-    # clocks are known within half a round trip only, but not its length: the spread is that of both ways together
+    # a clock error shifts delay from one way to the other, so only their sum is compared: the spread of both ways
     assert before.loop_delay_s_worst - before.loop_delay_s_least == pytest.approx(2 * 0.03 + PERIOD_S, rel=0.25)
 
 
-def test_measured_links_that_lose_datagrams_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_losses_of_measured_links_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
     lossy = VehicleLinks(system_id=3, up=Link(delay_s=0.02, loss_probability=0.4))
     links = CHAIN.links.model_copy(update={"vehicles": (lossy,)})
     for own, share in ((links, 0.4), (CHAIN.links, 0.0)):
@@ -190,7 +192,7 @@ def test_links_that_cannot_be_measured_before_a_flight_are_refused() -> None:
         measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
 
 
-def test_a_delay_that_nothing_takes_is_refused() -> None:
+def test_a_delay_that_no_gains_tolerate_is_refused() -> None:
     """Margins are designed up to 30 s, and the station predicts over 10 s at most."""
     delays = LinkPart(
         source="log", vehicles=(1,), loop_delay_s_least=22.0, loop_delay_s_p50=23.0, loop_delay_s_worst=24.0,
@@ -208,7 +210,7 @@ def static_decay_1_s(way: GainsAtDelay, first: float = 1.0, last: float = 1.0, *
     return -growth_rate(PAIR.A, PAIR.B, K, period_s=PERIOD_S, delay_s=share * way.loop_delay_s)
 
 
-def test_prediction_takes_longer_delays_at_equal_decay() -> None:
+def test_prediction_tolerates_longer_delays_at_equal_decay() -> None:
     """Two static gains and a delay: (2 - sqrt 2) / decay is the longest, docs/explanation/prediction.md."""
     design = flight_plan(load(SCENARIOS / "triangle5.toml"))[0]
     plain, *predicted = compared(design, "triangle5").ways

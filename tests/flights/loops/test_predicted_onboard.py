@@ -1,4 +1,4 @@
-"""Flights whose vehicles close loops of their own, and whose station predicts what it streams to them."""
+"""Flights of vehicles with loops on board, whose station predicts the acceleration that it streams to them."""
 
 from functools import cache
 
@@ -24,7 +24,7 @@ THESIS = load(SCENARIOS / "thesis_delay.toml")
 
 
 def triangle(prediction: float | str, *, link_s: float = 0.0, own: float = 0.2, others: float = 0.4) -> Scenario:
-    """The source's bidirectional three, with gains that lean more on each other: they take 0.206 s."""
+    """The source's bidirectional three, with gains that weigh the others more: they tolerate 0.206 s."""
 
     def scaled(block: GainBlock) -> GainBlock:
         share = own if block.vehicle == block.of else others
@@ -41,8 +41,8 @@ def planned(prediction: float | str) -> FlightPlan:
     return flight_plan(triangle(prediction).with_calm_monitor())[1]
 
 
-def test_the_window_is_that_of_own_loops_step_by_step() -> None:
-    """The map of one period, in which vehicles sense, compute and hold at their own steps: nothing is approximated."""
+def test_the_window_is_that_of_onboard_loops_stepped_exactly() -> None:
+    """The map of one period in which vehicles sense, compute and hold at their own steps, without approximation."""
     plan = planned(1.0)
     timing = onboard_timing(plan.scenario)
     assert timing is not None

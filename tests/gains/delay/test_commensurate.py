@@ -58,7 +58,7 @@ def test_published_spring_network_with_three_delays() -> None:
         assert start_s < delay_s < end_s
     for delay_s in entry["classification"]["unstable"]:
         assert not start_s < delay_s < end_s
-    # unstable without delay: the window is one that the delay makes
+    # unstable without delay: the loop is stable only within this window of delays
     assert analysis.unstable_roots_at_zero_delay == 2
 
 
@@ -230,7 +230,7 @@ def test_roots_of_many_multiples_are_counted(
 ) -> None:
     rng = np.random.default_rng([seed, states, *multiples])
     late = [rng.normal(size=(states, states)) / np.sqrt(states) for _ in multiples]
-    # -1 is in the middle of stable and unstable loops
+    # shifted by -1, about as many loops are stable as unstable
     now = (rng.normal(size=(states, states)) / np.sqrt(states) - np.eye(states)) * acts_at_once
     terms = [now, *(np.zeros_like(now) for _ in range(max(multiples)))]
     for multiple, matrix in zip(multiples, late, strict=True):

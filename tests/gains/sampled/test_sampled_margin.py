@@ -50,7 +50,7 @@ def test_a_margin_is_kept_for_the_same_loop_only() -> None:
 
 
 def random_loop(seed: int) -> tuple[Loop, float]:
-    """A loop of 1 to 3 states and 1 or 2 inputs, stable in continuous time, and a period it may or may not stand."""
+    """A loop of 1 to 3 states and 1 or 2 inputs, stable in continuous time, and a period, perhaps too long for it."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 4))
     inputs = int(rng.integers(1, min(n, 2) + 1))

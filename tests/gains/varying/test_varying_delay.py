@@ -1,4 +1,4 @@
-"""Bounds for delays that vary: published numbers, proofs below the exact margin, and delays that do their worst."""
+"""Bounds for delays that vary: published numbers, proofs below the exact margin, and worst-case delays."""
 
 from itertools import pairwise
 from math import inf, isnan, sqrt
@@ -45,7 +45,7 @@ def test_small_gain_of_one_signal_needs_no_scaling() -> None:
     assert varying_delay_bound(*FOLLOWER, rate=inf) >= (1.0 - 2.0 * BISECTION) / largest
 
 
-def test_bounds_fall_as_the_delay_may_do_more() -> None:
+def test_bounds_fall_as_the_delay_may_vary_faster() -> None:
     bounds = [varying_delay_bound(*FOLLOWER, rate=rate) for rate in (0.0, 0.3, 0.9, inf)]
     assert delay_margin(*FOLLOWER) >= bounds[0]
     assert all(more >= less * (1.0 - BISECTION) for more, less in pairwise(bounds))
@@ -61,7 +61,7 @@ def test_bounds_scale_with_time() -> None:
 
 def test_weak_delayed_part_takes_delays_of_any_length() -> None:
     assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.5) == inf
-    # 1 - mu < 1/4: the functional that does not ask for the length no longer proves it
+    # 1 - mu < 1/4: the functional that holds for any length no longer proves stability
     assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.8) < inf
 
 
@@ -108,8 +108,8 @@ def test_follower_survives_jumping_delays_below_the_bound(seed: int) -> None:
     assert flown(FOLLOWER, delays, step_s) < 0.5
 
 
-def test_sawtooth_beyond_the_constant_margin_is_not_promised() -> None:
-    # the other way round: at 1.1 margins a constant delay does grow, so the simulation can tell
+def test_the_simulation_grows_at_a_constant_delay_beyond_the_margin() -> None:
+    """So the simulation can tell stable from unstable."""
     delay_s = 1.1 * delay_margin(*FOLLOWER)
     assert flown(FOLLOWER, np.full(4000, delay_s), 0.01) > 2.0
 

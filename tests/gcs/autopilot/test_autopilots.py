@@ -19,7 +19,7 @@ AUTOPILOTS = {ARDUCOPTER: 3, PX4_COPTER: 12}
 
 
 class Told:
-    """The start-up of a vehicle that has sent its messages, without those with the ids in `but`, and accepted rates."""
+    """Start-up after a vehicle has sent all messages except the one with id `but`, and accepted their rates."""
 
     def __init__(self, kind: Kind, *, flags: int = GOOD, but: int = -1) -> None:
         self.startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
@@ -64,7 +64,7 @@ def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
     _, command = copter.advised(hold, armed=True)
     assert command is not None
     assert (command[0], command[1][6]) == (22, 604.0)
-    assert all(math.isnan(value) for value in command[1][3:6])  # numbers would be a place to fly to
+    assert all(math.isnan(value) for value in command[1][3:6])  # finite numbers would be a position to fly to
     copter.startup.accepted(22, (), 0)
     assert copter.advised(4 << 16 | 2 << 24, armed=True)[1] is None
     copter.at(19.5)
@@ -238,7 +238,7 @@ def test_the_local_height_carries_an_altitude_on_that_is_old() -> None:
     assert startup.relative_altitude_m == pytest.approx(20.3)
 
 
-def test_a_restarted_vehicle_has_to_say_its_origin_again() -> None:
+def test_a_restarted_vehicle_has_to_report_its_origin_again() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(49, (471000000, 81000000, 400_000, 0))
     for base_mode, known in ((128, True), (0, False)):  # an armed vehicle's clock has only jumped
@@ -248,7 +248,7 @@ def test_a_restarted_vehicle_has_to_say_its_origin_again() -> None:
         assert (startup.origin is not None) == known
 
 
-def test_states_in_a_frame_of_before_a_restart_are_dropped() -> None:
+def test_states_in_the_frame_before_a_restart_are_dropped() -> None:
     fleet, history = AutopilotFleet(plan_for(three()), ignored), StateHistory(3)
     for startup in fleet.starts:
         startup.take(49, (471000000, 81000000, 400_000, 0))

@@ -72,7 +72,7 @@ def of_each(law: FeedbackLaw) -> list[object]:
 
 
 @pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
-def test_others_do_without_a_vehicle_returning_by_its_own_law(gain: FloatArray) -> None:
+def test_others_fly_without_a_vehicle_returning_by_its_own_law(gain: FloatArray) -> None:
     away = (False, True, False, False, False)
     returning, lost, all_there = (
         of_each(feedback_law(TREE, (gain,), gone, back))

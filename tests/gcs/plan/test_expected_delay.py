@@ -175,7 +175,7 @@ def test_failsafes_are_expected_where_set_points_stay_away() -> None:
 
 
 def test_states_lost_in_bursts_are_late_ones() -> None:
-    """Lost one by one, they would be 0.14 s late at most for 99 % of the set-points."""
+    """With independent losses, states would be at most 0.14 s late for 99 % of the set-points."""
     bursts = LossBursts(to_bad_probability=0.02, to_good_probability=0.2)
     link = Link(delay_s=0.05, loss_bursts=bursts)
     scenario = calm_chain().model_copy(update={"links": Links(up=link, down=link), "duration_s": 120.0})
@@ -187,7 +187,7 @@ def test_states_lost_in_bursts_are_late_ones() -> None:
 
 
 def test_given_delays_are_off_by_the_wait_for_the_tick() -> None:
-    """Nobody knows it before a flight, in which it is the same throughout."""
+    """The wait is unknown before a flight and constant during it."""
     calm = calm_chain()
     rates = calm.rates.model_copy(update={"telemetry_hz": 10.0, "control_hz": 10.0})
     control = calm.control.model_copy(update={"prediction": 1.0, "delay_margin_s": 0.4})

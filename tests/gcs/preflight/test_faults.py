@@ -117,7 +117,7 @@ def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -
 
 @pytest.mark.slow(first=3)
 @pytest.mark.parametrize("gains", list(itertools.product((-1e5, 1e5), repeat=3)))
-def test_gains_of_any_size_are_assessed_and_truthfully_told(gains: tuple[float, float, float], tmp_path: Path) -> None:
+def test_gains_of_any_size_are_assessed_and_reported(gains: tuple[float, float, float], tmp_path: Path) -> None:
     file = with_gains(tmp_path, *gains)
     printed = CliRunner().invoke(app, ["design", str(file), "--allow-unstable"])
     assert printed.exit_code == 0, printed.output

@@ -1,4 +1,4 @@
-"""The recording of a flight as another program reads it: whole, with what was flown, and drawn without a complaint."""
+"""The recording of a flight as another program reads it: complete, with the values flown, and drawn without errors."""
 
 import subprocess
 import sys
@@ -124,7 +124,7 @@ def test_the_headless_viewer_opens_a_flight_without_view_errors(run: Path) -> No
 
 
 @pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")
-def test_a_recording_without_any_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
+def test_a_recording_without_any_tick_is_reported_in_one_line(run: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
     with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it, wanted a recording of a run"):

@@ -74,7 +74,7 @@ def test_positions_are_brought_to_the_ticks_instant(tmp_path: Path) -> None:
     np.testing.assert_allclose(seen_m, np.broadcast_to(wanted_m, seen_m.shape), atol=1e-3)  # float32 at 100 m
 
 
-def test_trails_join_up_to_the_way_flown(tmp_path: Path) -> None:
+def test_trails_join_up_to_the_path_flown(tmp_path: Path) -> None:
     write_run(tmp_path, FIVE, ticks_of(FIVE, start_s=0.0, count=101))
     _, pieces_m = read_back(record_run(tmp_path), "/ground/trails", "LineStrips3D:strips")
     np.testing.assert_array_equal(pieces_m[1:, :, 0], pieces_m[:-1, :, 1])
@@ -105,7 +105,7 @@ def test_events_before_the_flight_stand_at_the_recordings_start(tmp_path: Path) 
     ]
 
 
-def test_what_a_tick_says_of_several_vehicles_is_one_entry(tmp_path: Path) -> None:
+def test_the_same_event_of_several_vehicles_is_one_entry(tmp_path: Path) -> None:
     said = [("NOMINAL -> CAUTION", 4), ("NOMINAL -> CAUTION", 3), ("NOMINAL -> LOST", 2), ("NOMINAL -> CAUTION", 1)]
     with Recording(tmp_path, FIVE, DESIGN) as recording:
         events = [Event(time_s=2.5, kind="mode", system_id=system_id, text=text) for text, system_id in said]
@@ -142,7 +142,7 @@ def test_a_change_of_mode_is_one_entry_of_its_vehicle(tmp_path: Path) -> None:
     assert found == {f"/modes/{k}": ["NOMINAL"] for k in (1, 2, 3, 5)}
 
 
-def test_the_recording_brings_its_own_screen(tmp_path: Path) -> None:
+def test_the_recording_contains_its_blueprint(tmp_path: Path) -> None:
     with Recording(tmp_path, FIVE, DESIGN):
         assert (tmp_path / UNFINISHED_FILE).exists()
         assert not (tmp_path / RECORDING_FILE).exists()

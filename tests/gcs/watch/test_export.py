@@ -59,7 +59,7 @@ def test_a_run_as_mcap_holds_every_value_of_every_tick(
         assert np.isnan(values[~finite]).all()
 
 
-def test_exported_times_are_on_one_clock_without_leaps(
+def test_exported_times_are_on_one_clock_without_jumps(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert export(monkeypatch, run, "--csv", tmp_path / "csv") == 0
@@ -98,7 +98,7 @@ def test_a_log_as_csv_has_one_file_per_message_kind(run: Path, tmp_path: Path, m
         (["{run}", "--csv", "{run}"], "--csv: "),
     ],
 )
-def test_what_cannot_be_exported_is_told_in_one_line(
+def test_what_cannot_be_exported_is_reported_in_one_line(
     arguments: list[str],
     wanted: str,
     run: Path,

@@ -21,7 +21,7 @@ RUN = [sys.executable, "-m", "sim_vehicles.drive.cli"]
 
 
 class Client:
-    """A station of few words: one socket, pymavlink, and time-outs."""
+    """A minimal station: one socket, pymavlink, and time-outs."""
 
     def __init__(self, port: int = 0) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -60,7 +60,7 @@ def scenario_file(tmp_path: Path) -> Path:
 
 @contextmanager
 def vehicles(scenario_file: Path, client: Client, *options: str) -> Generator[subprocess.Popen[str]]:
-    """The command, running; it does not outlive the test."""
+    """The running command, which is killed when the test ends."""
     process = subprocess.Popen(
         [*RUN, str(scenario_file), "--station", f"127.0.0.1:{client.port}", *options],
         stdout=subprocess.PIPE,
@@ -86,7 +86,7 @@ def take_off(client: Client) -> None:
 
 
 @pytest.mark.realtime
-def test_a_vehicle_flown_by_a_client_tells_when_left_alone(client: Client, scenario_file: Path, tmp_path: Path) -> None:
+def test_a_vehicle_reports_that_its_client_has_stopped(client: Client, scenario_file: Path, tmp_path: Path) -> None:
     with vehicles(scenario_file, client, "--truth", str(tmp_path / "truth")) as process:
         take_off(client)
         client.say(heartbeat(), setpoint(10.0))
@@ -109,7 +109,7 @@ def test_a_vehicle_flown_by_a_client_tells_when_left_alone(client: Client, scena
         left = truth[truth["kind"] == LINK_UP]
         assert ((left["due_ns"] - left["entered_ns"]) == 5 * MS).all()
         assert (left["time_ns"] >= left["due_ns"]).all()
-        # Half of them are typically within 0.1 ms, but a loaded host puts off most.
+        # Half of them are typically within 0.1 ms, but a loaded host delays most.
         assert np.percentile(left["time_ns"] - left["due_ns"], 10) < MS
 
 
@@ -144,7 +144,7 @@ def test_ctrl_c_ends_it_with_130_and_a_summary(client: Client, scenario_file: Pa
 
 
 @pytest.mark.realtime
-def test_it_flies_on_when_whoever_reads_its_lines_is_gone(client: Client, scenario_file: Path) -> None:
+def test_it_flies_on_when_the_reader_of_its_output_exits(client: Client, scenario_file: Path) -> None:
     with vehicles(scenario_file, client) as process:
         assert process.stdout is not None
         process.stdout.close()

@@ -1,4 +1,4 @@
-"""The acceleration of a simulated multicopter against the transfer functions that its responses are said to have."""
+"""The acceleration of a simulated multicopter against the transfer functions of its response models."""
 
 import math
 
@@ -51,7 +51,7 @@ def test_beyond_its_jerk_limit_the_response_lags_far_behind() -> None:
     assert np.degrees(np.angle(beyond)) < np.degrees(np.angle(within)) - 30.0
 
 
-def test_a_remembering_response_keeps_to_its_acceleration_limit() -> None:
+def test_a_second_order_response_keeps_to_its_acceleration_limit() -> None:
     settings = MODELS[2].model_copy(update={"acceleration_max_m_s2": 2.5})
     motion, target = Motion(0j, inner=inner_of(settings)), Target(9.0 + 0j)
     motion, _ = advance(motion, target, settings, 3.0)

@@ -67,7 +67,7 @@ def file_request(operation: int, data: bytes = b"", number: int = 7) -> bytes:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_nobody_who_does_not_ask_is_sent_more_than_telemetry(kind: str) -> None:
+def test_a_client_that_asks_nothing_gets_only_telemetry(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     sent = sent_after(vehicle, heartbeat(), 3.0, 30.0)
     telemetry = {"HEARTBEAT", "TIMESYNC"} | (
@@ -186,7 +186,7 @@ def test_a_stream_request_is_limited_to_1000_hz() -> None:
     assert len(named(sent_after(VEHICLES["double_integrator"](), stream(10, 65_535), 5.0, 5.1), "ATTITUDE")) == 100
 
 
-def test_a_vehicle_at_the_end_of_the_world_still_reports() -> None:
+def test_a_vehicle_beyond_the_range_of_latitude_still_reports() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     vehicle.step([(command(512, 148), START)], START)
@@ -200,7 +200,7 @@ def test_a_vehicle_at_the_end_of_the_world_still_reports() -> None:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_intervals_are_set_told_and_reset(kind: str) -> None:
+def test_intervals_are_set_reported_and_reset(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     assert acknowledged(sent_after(vehicle, command(511, 30, 200_000), 5.0, 5.0), 511) == ACCEPTED
     (told,) = named(sent_after(vehicle, command(510, 30), 5.1, 5.1), "MESSAGE_INTERVAL")

@@ -55,20 +55,20 @@ class PilotsVehicle:
 
     @property
     def commanded(self) -> list[str]:
-        """What it was told that is none of the station's business: all but rates, and what keeps a PX4's door open."""
+        """Commands that the station should not send: all but rates, and set-points that only keep OFFBOARD open."""
         found = [
             str(message)
             for message in self.told
             if message.get_type() in COMMANDS and getattr(message, "command", 0) != SET_MESSAGE_INTERVAL
         ]
         hovers = [message for message in self.told if message.get_type() == SET_POINT]
-        if self.flavour == "px4":  # enters OFFBOARD, by its pilot's switch, only while set-points come
+        if self.flavour == "px4":  # its pilot can select OFFBOARD only while set-points arrive
             hovers = [m for m in hovers if (m.vx, m.vy, m.afx, m.afy) != (0.0, 0.0, 0.0, 0.0)]
         return found + [str(message) for message in hovers]
 
 
 def pilots_switch(flavour: str, mode: int) -> bytes:
-    """What a switch of the remote control does is the command, without a link."""
+    """The mode command that has the effect of a switch on the remote control, which needs no link."""
     packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
     return command(176, 1, *packed, system=3)
 
