@@ -21,7 +21,7 @@ def main() -> None:
     for name, flown in (("soft", scenario), ("linear", scenario.model_copy(update={"control": stated}))):
         flight = fly_virtual(flown, allow_code=True)
         margin_s, most_m_s2 = flight.design.delay_margin_s, float(np.nanmax(np.abs(flight.command_ne_m_s2)))
-        margin = flight.design.margin_unknown if margin_s is None else f"{margin_s:.3f} s"
+        margin = f"unknown: {flight.design.margin_unknown}" if margin_s is None else f"{margin_s:.3f} s"
         print(f"{name}: {flight.summary.verdict}, commands up to {most_m_s2:.1f} m/s² an axis, delay margin {margin}")
 
 
