@@ -123,15 +123,12 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     """The formation with the gains of one entry of a graph design's schedule."""
     formation = plan_formation(scenario)
     model, first = formation.model, np.array(design.K)
-    if design.loop == "onboard":
-        own = own_part(model, first)
-        gain = own + entry.streamed_share * (first - own)
-    else:
-        gain = time_scaled(model, first, entry.time_scale)
+    scaled = time_scaled(model, first, entry.time_scale)
+    own = own_part(model, scaled)
     answers = design.responses
     return FlownFormation(
         model,
-        gain,
+        own + entry.streamed_share * (scaled - own),
         flown_timing(design, entry.delay_margin_s),
         tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )

@@ -59,13 +59,12 @@ def _ages_s(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> dict[int,
     return {own: (at_s + block.timing.faster_s / 2.0) / 2.0 for own, at_s in loop_delay_s.items()}
 
 
-def _is_stable(plan: FlightPlan, block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
+def _is_stable(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
     """Whether a loop is predicted to be stable at expected loop delays, by counting its roots.
 
     In flights with three vehicles this was right to 0.2 % of the delay on the ground, and to 0.02 % on board.
     """
-    on_board = plan.scenario.control.loop == "onboard"
-    return block.is_stable_at(loop_delay_s, None if on_board else _ages_s(block, loop_delay_s))
+    return block.is_stable_at(loop_delay_s, _ages_s(block, loop_delay_s))
 
 
 def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
@@ -93,7 +92,7 @@ def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Windo
     def is_stable_at(delay_s: float) -> bool:
         delays_s = expected_s | {system_id: delay_s}
         if quick or len(block.system_ids) > _MOST_BY_GROWTH:
-            return _is_stable(plan, block, delays_s)
+            return _is_stable(block, delays_s)
         return growth_1_s(block, delays_s) < 0.0
 
     now_s = expected_s[system_id]
@@ -123,7 +122,7 @@ def unstable_over_links(plan: FlightPlan, *, but: int | None = None) -> list[int
     """The vehicles whose loops are predicted to be unstable over the scenario's links, except the loop of `but`."""
     expected_s = planned_loop_delays_s(plan)
     loops = plan_loops(plan) if is_modelled(plan) else []
-    unstable = [each for each in loops if but not in each.system_ids and not _is_stable(plan, each, expected_s)]
+    unstable = [each for each in loops if but not in each.system_ids and not _is_stable(each, expected_s)]
     return [own for block in unstable for own in block.system_ids]
 
 
@@ -193,11 +192,9 @@ def _own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, 
     already exceed them.
     """
     expected_s, own_s = planned_loop_delays_s(plan), dict[int, list[float]]()
-    if plan.scenario.control.loop == "onboard":
-        return {}
     for each, margin_s in zip((replace(plan, gain=K) for K in plan.gains), margins_s, strict=True):
         for block in plan_loops(each):
-            if not links_differ(each, block):
+            if block.extrapolated is None or not links_differ(each, block):
                 continue
             slowest = max(block.system_ids, key=expected_s.__getitem__)
             for own in block.system_ids:
@@ -225,7 +222,7 @@ def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
         return inf
 
     def is_stable_at(factor: float) -> bool:
-        return _is_stable(plan, block, {own: factor * at_s for own, at_s in own_s.items()})
+        return _is_stable(block, {own: factor * at_s for own, at_s in own_s.items()})
 
     stable, step = is_stable_at(1.0), _STEP * block.margin_s() / max(own_s.values())
     return _edge_s(is_stable_at, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)
