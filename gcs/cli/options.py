@@ -243,7 +243,8 @@ def listening(option: str, text: str, guard: "Guard | None" = None, networks: Se
     from gcs.drive.udp import StationSocket
 
     host, port = address(option, text)
-    ports = "a free UDP port" if len(networks) == 1 else f"free UDP ports, the one given plus {networks}"
+    every = ", ".join(map(str, networks))
+    ports = "a free UDP port" if every == "0" else f"free UDP ports, the one given plus {every}"
     with usable(f"{option}: {text}", f"{ports} of this machine"):
         return StationSocket(host, port, guard, networks)
 

@@ -246,9 +246,7 @@ def _flight(plan: FlightPlan, *, timed: bool = False, key: Key | None = None) ->
     taken_s, used_s = time.perf_counter() - begun_s, time.process_time() - used_s
     ticks = rows // len(plan.formation.system_ids)
     own_s = vehicles.taken_s if isinstance(vehicles, _Timed) else nan
-    return _Flown(
-        ticks, min(1.0, used_s / taken_s), taken_s / ticks, (taken_s - own_s) / ticks, own_s / ticks
-    )  # fmt: skip
+    return _Flown(ticks, min(1.0, used_s / taken_s), taken_s / ticks, (taken_s - own_s) / ticks, own_s / ticks)
 
 
 def position_frames(count: int) -> list[bytes]:
