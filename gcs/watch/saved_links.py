@@ -5,7 +5,8 @@ TIMESYNC requests; each stands for all datagrams until the next exchange. Both d
 vehicle's clock, which exchanges show only to within half a round trip. Its error adds to one direction what it takes
 from the other, so their sum is right. The least delays are equal both ways, unless the bounds of the clock exclude it.
 
-Losses up are counted from sequence numbers. Losses down cannot be observed here and are assumed to be the same.
+Losses up are counted from sequence numbers, as in a flight. Losses down, and whether datagrams overtake others there,
+cannot be observed here and are assumed to be the same.
 """
 
 from collections import Counter
@@ -36,11 +37,22 @@ class _OneVehicle:
         self.up_s: list[float] = []
         self.down_s: list[float] = []
         self.bound_s = 0.0
-        self.frames = 0
+        self.frames = self.lost = self.late = 0
         self.runs: list[int] = []
         """Length of each run of lost frames."""
-        self.sequence: int | None = None
         self.exchanges = 0
+        self.boot_ms: int | None = None
+        """Stamp of the newest position."""
+
+    def count(self, lost: int) -> None:
+        """Take in the number of frames lost so far. A late frame lowers it and shortens the newest run."""
+        more, self.lost = lost - self.lost, lost
+        if more > 0:
+            self.runs.append(more)
+        while more < 0 and self.runs:
+            left = self.runs.pop() + more
+            self.runs.extend([left] if left > 0 else [])
+            more = min(left, 0)
 
 
 class LinkRecorder:
@@ -59,20 +71,20 @@ class LinkRecorder:
             return
         own = self._seen.setdefault(frame.system_id, _OneVehicle())
         own.frames += 1
-        gap = 0 if own.sequence is None else (frame.sequence - own.sequence) % 256
-        if gap < 128:  # otherwise the frame is late
-            own.sequence = frame.sequence
-            if gap > 1:
-                own.runs.append(gap - 1)
+        own.count(vehicle.remote.frames.lost)
+        own.late = vehicle.remote.frames.late
         clock, exchanges = vehicle.remote.clock, len(vehicle.rtt_s)
         if exchanges > own.exchanges:
             own.exchanges = exchanges
             if exchanges > _SETTLED and clock.down_ns is not None:
                 own.down_s.append(clock.down_ns * 1e-9)
                 own.bound_s = max(own.bound_s, clock.down_bound_ns * 1e-9)
-        if exchanges <= _SETTLED or not clock.samples:
-            return
+        if exchanges <= _SETTLED or not clock.samples or clock.exchange_due:
+            return  # the clock is unknown, or may have jumped
         if frame.msg_id == mavlink.LOCAL_POSITION_NED:
+            if frame.fields[0] == own.boot_ms:
+                return  # an old state, sent once more
+            own.boot_ms = frame.fields[0]
             sampled_ns = to_station_ns(clock.estimate, boot_ns_of(clock.estimate, frame.fields[0], received_ns))
             own.up_s.append(max(0.0, (received_ns - sampled_ns) * 1e-9 - _BOOT_ROUNDING_S))
         elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:
@@ -97,12 +109,12 @@ class LinkRecorder:
             # each datagram of a burst ends it with probability r, so it lasts 1 / r; each good one begins one with p
             to_bad, to_good = len(lost) / max(received, len(lost)), len(lost) / sum(lost)
             loss = LossBursts(to_bad_probability=to_bad, to_good_probability=to_good)
-        bound_s = max(own.bound_s for own in seen)
+        bound_s, reordering = max(own.bound_s for own in seen), any(own.late for own in seen)
         return LinkProfile(
             source=source,
             licence="of whoever measured it",
-            up=_link(up, loss),
-            down=_link(np.repeat(down, each), loss),
+            up=_link(up, loss, reordering=reordering),
+            down=_link(np.repeat(down, each), loss, reordering=reordering),
             measured=Measured(up=_latency(up, bound_s, lost), down=_latency(down, bound_s, [])),
         )
 
@@ -139,10 +151,10 @@ def describe(profile: LinkProfile) -> list[str]:
     ]
 
 
-def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
-    """A link whose datagrams have these delays, in order."""
+def _link(delays_s: FloatArray, loss: LossBursts | None, *, reordering: bool) -> Link:
+    """A link whose datagrams have these delays, in order; with `reordering` they may overtake others."""
     trace = tuple(round(delay_s, 6) for delay_s in delays_s[:TRACE_DELAYS].tolist())
-    return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss)
+    return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss, reordering=reordering)
 
 
 def _latency(delays_s: FloatArray, bound_s: float, runs: list[int]) -> Latency:

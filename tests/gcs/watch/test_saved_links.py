@@ -13,6 +13,8 @@ from gcs.runs.record import SUMMARY_FILE
 from gcs.watch.saved_links import recorded
 from scenarios.errors import ScenarioError
 from scenarios.files import load, with_profile
+from scenarios.keys.link import Link
+from scenarios.keys.profile import Measured
 from scenarios.link_files import load_profile
 from scenarios.shipped import FOLDER, PROFILES, names
 
@@ -69,24 +71,74 @@ def test_unknown_profile_is_one_line(tmp_path: Path) -> None:
         load(file)
 
 
+Said = tuple[int, int, int, tuple[object, ...]]
+"""Time sent in ms, sequence number, message and its fields."""
+
+
+def exchange(k: int, boot_ms: int) -> list[Said]:
+    """The k-th request, its reply and a position, by a vehicle whose clock shows `boot_ms` at the request."""
+    ms = 1_000 + 50 * k
+    return [
+        (ms, -1, mavlink.TIMESYNC, (0, ms * MS)),
+        (ms + 10, 2 * k + 1, mavlink.TIMESYNC, ((boot_ms + 5) * MS, ms * MS)),
+        (ms + 20, 2 * k + 2, mavlink.LOCAL_POSITION_NED, (boot_ms + 15, *(0.0,) * 6)),
+    ]
+
+
+def measured_of(said: list[Said], others: tuple[tuple[int, mavlink.Frame], ...] = ()) -> tuple[Measured, Link]:
+    """What is measured of a vehicle, and the link up of its profile."""
+    first: Said = (1_000, 0, mavlink.HEARTBEAT, (0, 2, 3, 0, 4, 3))
+    frames = [*others]
+    for time_ms, sequence, msg_id, fields in [first, *said]:
+        station = sequence < 0
+        system_id, component_id = (255, 190) if station else (1, 1)
+        data = mavlink.encode(msg_id, fields, sequence=max(0, sequence), system_id=system_id)
+        [frame] = mavlink.decode(data, Counter())
+        frames.append((time_ms * MS, frame._replace(component_id=component_id)))
+    profile = recorded(sorted(frames, key=lambda each: each[0])).profile("here")
+    assert profile.measured is not None
+    assert profile.up is not None
+    return profile.measured, profile.up
+
+
 def test_a_camera_with_the_vehicles_id_loses_no_frames() -> None:
     """It numbers its frames apart."""
-    begin_ns = 1_000_000_000
-    said: list[tuple[int, int, int, int, int, tuple[object, ...]]] = [
-        (begin_ns, 1, 1, 0, mavlink.HEARTBEAT, (0, 2, 3, 0, 4, 3))
-    ]
+    cameras = []
     for k in range(100):
-        ns = begin_ns + 50 * MS * k
-        said += [
-            (ns, 255, 190, k, mavlink.TIMESYNC, (0, ns)),
-            (ns + 10 * MS, 1, 1, 2 * k + 1, mavlink.TIMESYNC, (ns + 5 * MS, ns)),
-            (ns + 20 * MS, 1, 1, 2 * k + 2, mavlink.LOCAL_POSITION_NED, (ns // MS + 15, *(0.0,) * 6)),
-            (ns + 30 * MS, 1, 100, 77 + k, mavlink.HEARTBEAT, (0, 30, 8, 0, 4, 3)),
-        ]
-    frames: list[tuple[int, mavlink.Frame]] = []
-    for time_ns, system_id, component_id, sequence, msg_id, fields in said:
-        [frame] = mavlink.decode(mavlink.encode(msg_id, fields, sequence=sequence, system_id=system_id), Counter())
-        frames.append((time_ns, frame._replace(component_id=component_id)))
-    measured = recorded(frames).profile("here").measured
-    assert measured is not None
+        data = mavlink.encode(mavlink.HEARTBEAT, (0, 30, 8, 0, 4, 3), sequence=77 + k, system_id=1)
+        [frame] = mavlink.decode(data, Counter())
+        cameras.append(((1_030 + 50 * k) * MS, frame._replace(component_id=100)))
+    said = [each for k in range(100) for each in exchange(k, 50 * k)]
+    measured, _ = measured_of(said, tuple(cameras))
     assert (measured.up.datagrams > 100, measured.up.lost) == (True, 0)
+
+
+def test_overtaken_frames_are_not_lost_but_overtaken() -> None:
+    said = [each for k in range(100) for each in exchange(k, 50 * k)]
+    late = [(ms + (60 if sequence % 20 == 10 else 0), sequence, kind, fields) for ms, sequence, kind, fields in said]
+    measured, up = measured_of(late)
+    assert (measured.up.lost, measured.up.loss_runs, up.reordering) == (0, 0, True)
+    assert measured_of(said)[1].reordering is False
+
+
+@pytest.mark.parametrize("exchanges", [10, 100, 200])
+def test_a_run_of_losses_of_any_length_is_counted(exchanges: int) -> None:
+    """200 exchanges are 400 frames, past the range of a sequence number."""
+    said = [each for k in range(400) for each in exchange(k, 50 * k) if not 100 <= k < 100 + exchanges]
+    measured, _ = measured_of(said)
+    assert (measured.up.lost, measured.up.loss_runs) == (2 * exchanges, 1)
+
+
+@pytest.mark.parametrize("jump_ms", [-3_000, 2_000])
+def test_a_clock_that_jumps_delays_nothing(jump_ms: int) -> None:
+    """Positions between the jump and the next exchange tell no delay, nor do old ones that are sent once more."""
+    boots_ms = [10_000 + 50 * k for k in range(200)]
+    said = [each for k, boot_ms in enumerate(boots_ms[:100]) for each in exchange(k, boot_ms)]
+    said += (
+        exchange(100, boots_ms[100])[:2] + exchange(100, boots_ms[100] + jump_ms)[2:]
+    )  # it jumps before the position
+    said += [each for k in range(101, 200) for each in exchange(k, boots_ms[k] + jump_ms)]
+    said += [(11_000 + 50 * k, 401 + k, *said[-1][2:]) for k in range(50)]
+    measured, _ = measured_of(said)
+    assert measured.up.delay_s_p50 == pytest.approx(0.005, abs=0.001)
+    assert measured.up.variation_s_p99 < 0.002
