@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 import time  # noqa: TID251 - names the run's folder, paces virtual time and waits for the observer
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from operator import itemgetter
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from gcs.drive.sitl import VehicleProcess
 from gcs.drive.takeover import CONNECTED
 from gcs.drive.udp import StationSocket, clock_ns, drive
 from gcs.interrupts import held_back, stop_signals
-from gcs.link.datagram import Frames
+from gcs.link.datagram import Frames, Logged
+from gcs.link.mavlink import is_timesync_request
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described, identified
@@ -99,6 +100,13 @@ def fly(
         return finish(folder, unwritten=unwritten)
 
 
+def _in_order(received: Frames, sent: Sequence[Logged]) -> Frames:
+    """Frames by time. At one instant, requests come before their replies, which links without delay bring at once."""
+    requests = [each for each in sent if is_timesync_request(each[0])]
+    others = [each for each in sent if not is_timesync_request(each[0])]
+    return Frames(sorted([*requests, *received, *others], key=itemgetter(1)))
+
+
 def fly_in_virtual_time(
     plan: FlightPlan,
     design: Design,
@@ -122,8 +130,7 @@ def fly_in_virtual_time(
             began_s, time_s, flown = time.monotonic(), 0.0, plan
             for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
                 writer.tick(rows)
-                frames = sorted([*station.frames, *vehicles.take_sent()], key=itemgetter(1))
-                writer.frames(Frames(frames), EPOCH_NS)
+                writer.frames(_in_order(station.frames, vehicles.take_sent()), EPOCH_NS)
                 writer.event(*station.events)
                 station.events.clear()
                 time_s = float(rows["time_s"][0])

@@ -48,6 +48,8 @@ _HEADER, _HEADER_1_BYTES = struct.Struct("<BBBBBBBHB"), 6
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _OVERHEAD, _OVERHEAD_1 = 12, 8
+_TIMESYNC_REQUEST = TIMESYNC.to_bytes(3, "little") + bytes(8)
+"""The message id and the first field of a request."""
 
 
 class _Layout(NamedTuple):
@@ -231,6 +233,11 @@ def heartbeat() -> tuple[Any, ...]:
 def timesync(*, tc1_ns: int, ts1_ns: int) -> tuple[Any, ...]:
     """Fields of TIMESYNC: a request has tc1 = 0, a reply mirrors ts1."""
     return (tc1_ns, ts1_ns)
+
+
+def is_timesync_request(data: bytes) -> bool:
+    """Whether a MAVLink 2 frame is a TIMESYNC whose tc1, its first field, is 0."""
+    return data[7 : _HEADER.size + 8] == _TIMESYNC_REQUEST
 
 
 def statustext(severity: int, text: str) -> tuple[Any, ...]:

@@ -44,6 +44,17 @@ def test_saved_links_lead_to_the_same_loop_delay(tmp_path: Path) -> None:
     assert measured.up.lost > 0
 
 
+def test_links_without_delay_can_be_replayed_and_saved(tmp_path: Path) -> None:
+    """Requests and their replies have the same time in the log."""
+    out = str(tmp_path / "a")
+    flown = run("fly", "chain3", "--link-delay", "0", "--virtual", "--out", out).splitlines()
+    replayed = run("replay", out, "--save-links", str(tmp_path / "none.toml")).splitlines()
+    for heading in ("verdict", "delay"):
+        assert [line for line in flown if line.startswith(heading)] == [
+            line for line in replayed if line.startswith(heading)
+        ]
+
+
 def test_links_are_found_relative_to_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "measured").mkdir()
     (tmp_path / "measured" / "links.toml").write_text((PROFILES / "lte.toml").read_text(encoding="utf-8"))
