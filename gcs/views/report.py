@@ -20,7 +20,7 @@ from gcs.plan.design import (
     TradeOffPoint,
     WindowAt,
 )
-from gcs.runs.record import RECORDING_FILE, STARTED
+from gcs.runs.record import RECORDING_FILE, STARTED, TICKS_FILE
 from gcs.runs.refusals import in_words
 from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, growth_text, ms_text, number_text, plain_console, table_of, vehicles_text
@@ -318,7 +318,11 @@ def _spread_text(spread: FlownSpread) -> str:
 
 
 def _reason(summary: Summary) -> str:
-    """How the flight ended or, if it was completed but unstable, why it counts as unstable."""
+    """How the flight ended and, if it was completed, why it counts as unstable or unknown."""
+    if summary.verdict == "unknown":
+        missing = any(text.startswith(TICKS_FILE) for text in summary.not_logged)
+        why = "part of the tick log is missing" if missing else "a loop delay was unknown at the end"
+        return f"{summary.reason}, but {why}"
     final_m, most_m = summary.spacing_error_final_m, summary.spacing_error_max_m
     completed = summary.reason.startswith("completed")
     if summary.verdict != "unstable" or not completed or final_m is None or most_m is None:

@@ -47,3 +47,18 @@ def test_broken_flight_is_not_told_that_errors_do_not_grow() -> None:
     assert "grow" not in lines["alpha"]
     assert " by the model of small errors at " in lines["alpha"]
     assert lines["delay"].endswith("; set-points that were lost do not show in it")
+
+
+def test_unknown_verdict_says_what_is_unknown() -> None:
+    """Nothing reaches the last vehicle from 5 s on, which keeps flying."""
+    calm = Link(delay_s=0.02)
+    dead = calm.model_copy(update={"outages": (Outage(from_s=5.0, until_s=100.0),)})
+    chain = load(located("chain3"))
+    safety = chain.safety.model_copy(update={"setpoint_timeout_s": 100.0, "heartbeat_timeout_s": 100.0})
+    links = Links(up=calm, down=calm, vehicles=(VehicleLinks(system_id=3, up=calm, down=dead),))
+    summary = fly_virtual(chain.model_copy(update={"safety": safety, "links": links})).summary
+    said = flight_lines(summary)["verdict"]
+    assert (summary.verdict, said.partition("; ")[0]) == (
+        "unknown",
+        "completed: duration reached, but a loop delay was unknown at the end",
+    )
