@@ -260,7 +260,7 @@ class WatchedVehicle:
             return PAST
         if not self.remote.clock.samples or not self.answers(now_ns):
             return "no exchange"
-        return "no position" if loop_delay_s is None else "measured"
+        return "no position" if loop_delay_s is None or self._has_gap(now_ns) else "measured"
 
 
 class Watch:

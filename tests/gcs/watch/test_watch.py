@@ -405,6 +405,19 @@ def test_a_delay_is_unknown_once_exchanges_have_stopped() -> None:
     assert vehicle.telemetry_age_s.p50 is not None
 
 
+@pytest.mark.parametrize(("stopped_s", "status"), [(1.0, "measured"), (2.0, "no position")])
+def test_positions_that_have_stopped_are_not_measured(stopped_s: float, status: str) -> None:
+    """The vehicle still answers."""
+    watch, peer, now_ns = Watch([1]), Peer(1), 0
+    for tick in range(200):
+        now_ns = 100 * START_NS + 50 * MS * tick
+        if tick < 200 - 20 * stopped_s:
+            peer.say(watch, mavlink.LOCAL_POSITION_NED, (now_ns // MS, *(0.0,) * 6), now_ns)
+        peer.say(watch, mavlink.TIMESYNC, (now_ns, watch.ask(now_ns)), now_ns)
+        watch.look(now_ns)
+    assert [figures.status for figures in watch.figures(now_ns, None)] == [status]
+
+
 @pytest.mark.parametrize("margin_s", [None, 0.3])
 @pytest.mark.parametrize(("stopped_s", "judged"), [(0.0, True), (3.0, True), (5.0, False), (10.0, False)])
 def test_link_with_margin_passes_only_if_last_delay_is_known(
