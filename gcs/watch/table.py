@@ -29,7 +29,7 @@ def render(report: WatchReport, *, width: int, height: int | None = None) -> Ren
         vehicles = sorted(sorted(vehicles, key=_badness)[: max(1, room - 1)], key=lambda figures: figures.system_id)
     table = links_table(vehicles, width) if vehicles else Text("no vehicle heard", "bold red")
     hidden = len(report.vehicles) - len(vehicles)
-    return Group(_headline(report), table, *not_shown(hidden), *notes, _footer(report))
+    return Group(_headline(report), table, *not_shown(hidden), *notes, _footer(report, is_whole=height is None))
 
 
 def plain_line(report: WatchReport) -> str:
@@ -116,7 +116,8 @@ def _of_rates(report: WatchReport) -> list[Text]:
     return [Text(f"positions at {slowest_hz:.3g} Hz from {' '.join(map(str, slow))}{effect}", "yellow")]
 
 
-def _footer(report: WatchReport) -> Text:
+def _footer(report: WatchReport, *, is_whole: bool) -> Text:
+    """What was sent and left out; on one line, unless the display is `is_whole`, of any height."""
     asked = report.sent.get("SET_MESSAGE_INTERVAL", 0)
     more = f"{asked} requests for positions" if asked else "nothing else"
     text = "nothing is sent" if report.silent else f"sent {report.sent['TIMESYNC']} TIMESYNC requests, {more}"
@@ -124,7 +125,7 @@ def _footer(report: WatchReport) -> Text:
         text += f"; stations heard: {' '.join(map(str, report.stations))}"
     if report.refused:
         text += "; left out: " + ", ".join(f"{count} {reason}" for reason, count in report.refused.items())
-    return Text(text, style="dim", no_wrap=True, overflow="ellipsis")
+    return Text(text, style="dim", no_wrap=not is_whole, overflow="fold" if is_whole else "ellipsis")
 
 
 def _ms(seconds: float | None, before: str = "") -> str:

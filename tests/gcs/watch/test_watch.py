@@ -392,6 +392,9 @@ def test_a_second_vehicle_with_the_same_id_is_counted_apart() -> None:
     assert figures.telemetry_hz == pytest.approx(20.0)
     assert (figures.received, figures.late) == (100, 0)
     assert watch.counters == {"known system id from another address": 100}
+    text, report = io.StringIO(), report_of([figures]).model_copy(update={"refused": dict(watch.counters)})
+    Console(file=text, width=50).print(render(report, width=50))  # what is printed at the end is whole
+    assert "left out: 100 known system id from another address" in " ".join(text.getvalue().split())
 
 
 def test_a_delay_is_unknown_once_exchanges_have_stopped() -> None:
