@@ -111,6 +111,11 @@ def text_of(field: bytes) -> str:
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
+def is_finite(frame: Frame) -> bool:
+    """Whether a frame is no position used for control, or one without NaN and infinity."""
+    return frame.msg_id != LOCAL_POSITION_NED or isfinite(sum(frame.fields))
+
+
 def target_system(frame: Frame) -> int:
     """The system that a frame is addressed to; 0 for all."""
     place = _TARGET_PLACES.get(frame.msg_id)
@@ -125,8 +130,8 @@ def message_name(msg_id: int) -> str:
 def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The valid MAVLink 2 frames of one datagram; refused ones are counted by reason, and nothing is raised.
 
-    Each datagram is parsed on its own, so a truncated frame cannot swallow the next datagram. A position used for
-    control is refused if it contains NaN or infinity, which a checksum does not show.
+    Each datagram is parsed on its own, so a truncated frame cannot swallow the next datagram. Numbers may be NaN or
+    infinite, which a checksum does not show; see `is_finite`.
     """
     end = len(datagram)
     if end >= _OVERHEAD and datagram[0] == MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
@@ -209,9 +214,6 @@ def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
         fields = packing.unpack_from(data, begin)
     else:  # MAVLink 2 omits trailing zeros; a newer dialect may add fields, which are ignored
         fields = packing.unpack(data[begin : begin + min(length, full_length)].ljust(full_length, b"\0"))
-    if msg_id == LOCAL_POSITION_NED and not isfinite(sum(fields)):
-        refused["not finite"] += 1
-        return None
     return Frame(msg_id, system_id, component_id, sequence, fields, data)
 
 

@@ -37,6 +37,7 @@ AUTOPILOT_COMPONENT = 1
 """Component id of the autopilot. A camera, gimbal or companion has the vehicle's system id and sends its own
 heartbeats, perhaps from another port: they show neither where the autopilot is nor that it is alive."""
 ANOTHER_ADDRESS = "known system id from another address"
+NOT_FINITE = "not finite"
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 REPORTED = np.dtype(
     [
@@ -195,6 +196,9 @@ class Reception:
             self.touched.add(row)
             self.frames.append((frame.data, datagram.received_ns, datagram.address))
             if vehicle.is_replay(frame, datagram.received_ns):
+                continue
+            if not mavlink.is_finite(frame):
+                self.counters[NOT_FINITE] += 1
                 continue
             self._handle(row, vehicle, frame, datagram, now, outgoing)
 

@@ -31,7 +31,7 @@ from gcs.link.vehicle import SILENCE_S, RemoteVehicle
 from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
-from gcs.station.reception import ANOTHER_ADDRESS
+from gcs.station.reception import ANOTHER_ADDRESS, NOT_FINITE
 from scenarios.schema import NS_PER_S, Rates
 
 if TYPE_CHECKING:
@@ -307,6 +307,9 @@ class Watch:
             return None
         remote.heard_ns, remote.address = time_ns, address
         if remote.is_replay(frame, time_ns):
+            return None
+        if not mavlink.is_finite(frame):
+            self.counters[NOT_FINITE] += 1
             return None
         if frame.msg_id == mavlink.HEARTBEAT:
             remote.heartbeat(frame.fields, time_ns)

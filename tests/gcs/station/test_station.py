@@ -185,6 +185,18 @@ def test_a_companion_takes_no_vehicles_place() -> None:
     assert station.counters == {"other component": 2}
 
 
+def test_a_position_that_is_not_finite_is_refused_but_not_lost() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = station.vehicles[1]
+    said = [peer.heartbeat(S)]
+    for north_m in (1.0, float("nan"), float("inf"), 2.0):
+        frame = peer.link.local_position_ned_encode(1, north_m, 0, 0, 0, 0, 0)
+        said.append(peer.datagram(frame, S))
+    station.step(said, S)
+    assert station.counters == {"not finite": 2}
+    assert (vehicle.frames.received, vehicle.frames.lost, len([*station.frames])) == (5, 0, 5)
+
+
 def test_only_a_heartbeat_makes_a_vehicle_known() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     station.step([peer.datagram(peer.link.local_position_ned_encode(1, 0, 0, 0, 0, 0, 0), S)], S)

@@ -421,6 +421,17 @@ def test_positions_that_have_stopped_are_not_measured(stopped_s: float, status: 
     assert [figures.status for figures in watch.figures(now_ns, None)] == [status]
 
 
+def test_positions_that_are_not_finite_are_left_out_but_not_lost() -> None:
+    watch, peer = Watch([1]), Peer(1)
+    for tick in range(100):
+        now_ns = 100 * START_NS + 50 * MS * tick
+        north_m = float("nan") if tick % 2 else 0.0
+        peer.say(watch, mavlink.LOCAL_POSITION_NED, (now_ns // MS, north_m, *(0.0,) * 5), now_ns)
+    [figures] = watch.figures(100 * START_NS, None)
+    assert (figures.received, figures.lost, watch.vehicles[1].states) == (100, 0, 50)
+    assert watch.counters == {"not finite": 50}
+
+
 @pytest.mark.parametrize("margin_s", [None, 0.3])
 @pytest.mark.parametrize(("stopped_s", "judged"), [(0.0, True), (3.0, True), (5.0, False), (10.0, False)])
 def test_link_with_margin_passes_only_if_last_delay_is_known(
