@@ -55,7 +55,7 @@ FORGET_NUMBERS_NS = 3 * NS_PER_S
 SILENCE_S = 1.5
 """A vehicle without telemetry for this long is lost: it gets no more set-points, and the others fly without it. One
 that sends nothing at all for this long may come back from another address."""
-_MAVLINK_1 = "speaks MAVLink 1, wanted MAVLink 2; on an ArduPilot, set SERIALn_PROTOCOL to 2"
+MAVLINK_1 = "speaks MAVLink 1, wanted MAVLink 2; on an ArduPilot, set SERIALn_PROTOCOL to 2"
 _SILENT_NS = 3 * NS_PER_S
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
 
@@ -271,8 +271,8 @@ class RemoteVehicle:
         self.has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
         """When the first heartbeat after a long silence arrived. Its sequence number does not reveal a replay."""
-        self.speaks_mavlink_1 = False
-        """Whether its last message of which MAVLink 2 is expected was MAVLink 1."""
+        self.unusable = ""
+        """Why its newest frames cannot be used; empty if they can."""
         self._land = land
         self._now_ns = 0
         self._report = report
@@ -353,7 +353,7 @@ class RemoteVehicle:
     def missing(self) -> str:
         """Why the vehicle is not ready or, at the end, has not ended, in words; empty if it is or has."""
         if self.address is None:
-            return _MAVLINK_1 if self.speaks_mavlink_1 else "not heard"
+            return self.unusable or "not heard"
         if self.silent:
             return "is silent"
         if self.goal is Goal.END:
@@ -362,7 +362,7 @@ class RemoteVehicle:
             left = "left" if self.has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         missing = self._next_step().missing
-        return _MAVLINK_1 if missing and self.speaks_mavlink_1 else missing
+        return missing and (self.unusable or missing)
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:
         """A frame to this vehicle. Each vehicle gets its own sequence numbers, by which it can count losses."""

@@ -29,7 +29,7 @@ from gcs.link.mavlink import (
     unsigned_at,
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
-from gcs.link.vehicle import FORGET_NUMBERS_NS, RemoteVehicle, Report, delivery_ns, heartbeat_state
+from gcs.link.vehicle import FORGET_NUMBERS_NS, MAVLINK_1, RemoteVehicle, Report, delivery_ns, heartbeat_state
 from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
@@ -117,6 +117,8 @@ class Reception:
         """Number of refused frames, by reason."""
         self.touched: set[int] = set()
         """Rows of vehicles that have sent something kernels do not handle since `touched` was last cleared."""
+        self._doubled: set[int] = set()
+        """Rows of vehicles of which a second sender is reported."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
@@ -176,18 +178,23 @@ class Reception:
             # PX4 sends heartbeats in MAVLink 1 until it is answered in MAVLink 2
             is_early = self._fleet.speaks_mavlink_1_first and frame.msg_id == HEARTBEAT
             if frame.component_id == AUTOPILOT_COMPONENT and not (is_1 and is_early):
-                vehicle.speaks_mavlink_1 = is_1
+                vehicle.unusable = MAVLINK_1 if is_1 else ""
             if is_1 and not is_early:
                 self.counters["not MAVLink 2"] += 1
                 continue
             if frame.component_id != AUTOPILOT_COMPONENT:
                 self.counters["other component"] += 1
+                if vehicle.address is None:
+                    vehicle.unusable = f"is heard only as component {frame.component_id}, wanted 1, the autopilot"
                 if vehicle.address == datagram.address:
                     self.frames.append((frame.data, datagram.received_ns, datagram.address))
                 continue
             if vehicle.address != datagram.address:
                 if not vehicle.accepts_address(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
+                    if vehicle.is_elsewhere(datagram.address, datagram.received_ns) and row not in self._doubled:
+                        self._doubled.add(row)
+                        self._report("vehicle", "has a second sender, whose frames are refused", vehicle.system_id)
                     continue
                 vehicle.address = datagram.address
                 self._report("vehicle", "found", vehicle.system_id)

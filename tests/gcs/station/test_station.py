@@ -158,7 +158,9 @@ def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     station.step([peer.heartbeat(S)], S)
     station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)
     assert station.vehicles[1].address == HOME
-    assert station.counters == {"known system id from another address": 1}
+    station.step([thief.heartbeat(S + 200 * MS)], S + 200 * MS)
+    assert station.counters == {"known system id from another address": 2}
+    assert [event.system_id for event in station.events if "second sender" in event.text] == [2]
     station.step([thief.heartbeat(S + 5 * S)], S + 5 * S)  # as after a restart of the vehicle
     assert station.vehicles[1].address == thief.address
 
@@ -179,7 +181,9 @@ def test_a_companion_takes_no_vehicles_place() -> None:
     vehicle = station.vehicles[1]
     station.step([companion.heartbeat(S)], S)
     assert (vehicle.address, vehicle.first_heard_ns) == (None, None)
+    assert vehicle.missing == "is heard only as component 191, wanted 1, the autopilot"
     station.step([peer.heartbeat(2 * S)], 2 * S)
+    assert "component" not in vehicle.missing
     station.step([companion.heartbeat(9 * S)], 9 * S)  # the vehicle is silent
     assert (vehicle.address, vehicle.heard_ns) == (HOME, 2 * S)
     assert station.counters == {"other component": 2}
