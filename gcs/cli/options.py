@@ -175,7 +175,7 @@ def flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable:
         refuse_or_warn(file, unstable, allow=allow_unstable)
         return design, faults.without_actions(plan)
     design, flown = planner.over_own_links(design, plan)
-    if flown is not plan:
+    if flown.margins_s != plan.margins_s:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)
         finding = f"the margin is {own} for the slowest of them, {alike} if delays were alike"
         warn(file, f"vehicles share a loop, and their loop delays differ: {finding}")

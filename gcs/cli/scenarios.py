@@ -196,7 +196,9 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     """Lines on the loop delay expected over the links, and on the headroom it leaves."""
     from gcs.views.console import ms_text, number_text
 
-    margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
+    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
+    margin_s = design.margin_of(slowest.system_id)
+    margin = "no limit" if margin_s is None else ms_text(margin_s)
     margin = "unknown" if design.margin_unknown else margin
     if found.mismatch_window_s is not None:
         least_s, most_s = found.mismatch_window_s
@@ -205,12 +207,13 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     else:
         margin = f"margin {margin}"
     unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
-    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
     whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
+    least = min(found.vehicles, key=lambda v: inf if v.headroom is None else v.headroom)
+    of = "" if least is slowest or not whose else f" of vehicle {least.system_id}"
     yield (
         f"delay    loop {ms_text(found.expected_loop_delay_s, unit='')} ± {ms_text(found.phase_s)} expected from the "
         f"links{whose}, {margin}, "
-        f"headroom {number_text(found.headroom, '.0%')}{unstable}"
+        f"headroom {number_text(found.headroom, '.0%')}{of}{unstable}"
     )
     if not found.response_known:
         yield "         if the vehicles responded at once: how autopilots respond is known once they are identified"

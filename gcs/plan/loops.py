@@ -176,27 +176,54 @@ def plan_over_links(plan: FlightPlan) -> FlightPlan:
 
     Returns the plan itself if the margins for equal delays apply, or if responses of vehicles are not known yet.
     """
-    known = plan.scenario.dynamics != "autopilot" or plan.responses is not None
-    margins_s = margins_over_links_s(plan) if known else None
-    if margins_s is None or margins_s == plan.margins_s:
+    if plan.scenario.dynamics == "autopilot" and plan.responses is None:
         return plan
-    own_s = {**plan.own_margins_s, **_own_margins_s(plan, margins_s)}
-    return replace(plan.with_margins(margins_s, plan.responses), own_margins_s=own_s)
+    margins_s = margins_over_links_s(plan)
+    shared_s = {} if margins_s is None else _own_margins_s(plan)
+    own_s = {**plan.own_margins_s, **_margins_alike_s(plan), **shared_s}
+    if (margins_s is None or margins_s == plan.margins_s) and own_s == plan.own_margins_s:
+        return plan
+    return replace(plan.with_margins(margins_s or plan.margins_s, plan.responses), own_margins_s=own_s)
 
 
-def _own_margins_s(plan: FlightPlan, margins_s: tuple[float, ...]) -> dict[int, tuple[float, ...]]:
+def _margins_alike_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
+    """Delay margins (s) with each of the plan's gains, by row, of the vehicles whose loop has one loop delay.
+
+    They are only for formations on the ground loop whose links differ: a slow link then uses up the margin of its own
+    loop, not that of the loop with the least. Empty if no such vehicle has more than the formation's.
+    """
+    control, delays_s = plan.scenario.control, planned_loop_delays_s(plan)
+    if control.loop == "onboard" or control.prediction != "off" or not is_modelled(plan):
+        return {}
+    if len(set(delays_s.values())) == 1:
+        return {}
+    own_s, known_s = dict[int, list[float]](), dict[Hashable, float]()
+    for number, each in enumerate(replace(plan, gain=K) for K in plan.gains):
+        for block in plan_loops(each):
+            if len({delays_s[own] for own in block.system_ids}) > 1:
+                continue
+            key = number, block.kind
+            if key not in known_s:
+                known_s[key] = block.margin_s()
+            for own in block.system_ids:
+                own_s.setdefault(plan.formation.row(own), []).append(known_s[key])
+    found = {row: tuple(own) for row, own in own_s.items() if len(own) == len(plan.gains)}
+    return found if any(own[0] > plan.delay_margin_s for own in found.values()) else {}
+
+
+def _own_margins_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
     """Delay margins (s) of single vehicles with each of the plan's gains, by row, all other links as in the scenario.
 
-    They are only for vehicles that share a loop on the ground over different links. `margins_s` are those of
-    `margins_over_links_s`. The slowest vehicle keeps these if they are smaller, and all vehicles keep them if the links
-    already exceed them.
+    They are only for vehicles that share a loop on the ground over different links. The slowest vehicle keeps the
+    margin of its loop over these links if that is smaller, and all its vehicles keep it if the links already exceed it.
     """
     expected_s, own_s = planned_loop_delays_s(plan), dict[int, list[float]]()
-    for each, margin_s in zip((replace(plan, gain=K) for K in plan.gains), margins_s, strict=True):
+    for each in (replace(plan, gain=K) for K in plan.gains):
         for block in plan_loops(each):
             if block.extrapolated is None or not links_differ(each, block):
                 continue
             slowest = max(block.system_ids, key=expected_s.__getitem__)
+            margin_s = expected_s[slowest] * breaking_factor(each, block)
             for own in block.system_ids:
                 found = margin_s
                 if margin_s > expected_s[slowest]:

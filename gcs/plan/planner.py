@@ -132,13 +132,15 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def over_own_links(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan with their margins over the scenario's links, if vehicles share a loop over different links.
+    """Design and plan with their margins over the scenario's links, if these differ.
 
     Otherwise, and for vehicles whose response is not known yet, they stay as they are.
     """
     flown = plan_over_links(plan)
     if flown is plan:
         return design, plan
+    if flown.margins_s == plan.margins_s:
+        return _with_own_margins(design, flown), flown
     continuous_s = [entry.delay_margin_continuous_s for entry in design.schedule]
     over_links = design.with_margins(flown.margins_s, continuous_s)
     return _with_own_margins(over_links.model_copy(update={"margin_over_links": True}), flown), flown

@@ -69,7 +69,7 @@ def test_a_quick_vehicle_keeps_its_margin_beside_a_slow_link() -> None:
     _, quick, slow = check(plan).vehicles
     assert plan.delay_margin_s == pytest.approx(0.7755, abs=1e-3)
     assert known(quick.headroom) == pytest.approx(1.0 - 0.07 / 0.2895, abs=5e-3)
-    assert known(slow.headroom) == pytest.approx(1.0 - 0.51 / 0.7755, abs=5e-3)
+    assert known(slow.headroom) == pytest.approx(1.0 - 0.51 / 1.4235, abs=5e-3)  # a monodromy matrix: 1.42348 s
     flown = fly_virtual(scenario).summary
     assert flown.verdict == "stable"
     assert known(flown.vehicles[1].headroom_min_s) == pytest.approx(0.2895 - 0.074, abs=0.01)
@@ -85,6 +85,27 @@ def test_the_monitor_slows_gains_before_a_quick_vehicle_breaks_them() -> None:
         slower = replace(plan, scenario=late.model_copy(update={"monitor": monitor}))
         flight = fly_plan(slower)
         assert summarise(slower.scenario, design, flight.ticks, flight.events).verdict == verdict
+
+
+def test_a_slow_vehicle_of_a_tree_keeps_its_own_margin() -> None:
+    """Without the coupling of `QUICK_AND_SLOW` vehicle 3 closes its own loop, whose margin is far above vehicle 2's."""
+    tree = {(i, j): gains for (i, j), gains in QUICK_AND_SLOW.items() if i == j}
+    scenario = over(chain(tree), 0.03, v3=0.25)
+    slow = check(over_own_links(*flight_plan(scenario))[1]).vehicles[2]
+    left_s = known(slow.link_delay_left_s)
+    assert known(slow.headroom) == pytest.approx(left_s / (0.51 + left_s), abs=1e-3)
+    flown = fly_virtual(scenario).summary
+    assert flown.verdict == "stable"
+    assert not [each for each in flown.mode_changes if "CRITICAL" in each.text]
+
+
+def test_a_shared_loop_is_not_judged_by_a_vehicle_outside() -> None:
+    """Vehicles 1 and 2 share a loop over different links; vehicle 3 has a loop of its own with a shorter margin."""
+    shared = {(1, 1): (-2.0,), (1, 2): (-0.02, 0.02), (2, 1): (0.02,), (2, 2): (0.25, -0.8)}
+    scenario = over(chain(shared | {(3, 3): (6.0, -3.5)}), 0.01, v2=0.25)
+    slow = check(over_own_links(*flight_plan(scenario))[1]).vehicles[1]
+    alone = over(chain(shared | {(3, 3): (0.25, -0.8)}), 0.01, v2=0.25)
+    assert slow.headroom == check(over_own_links(*flight_plan(alone))[1]).vehicles[1].headroom
 
 
 def test_a_predicted_leader_that_hears_nobody_has_no_limit() -> None:
