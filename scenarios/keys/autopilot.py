@@ -13,7 +13,8 @@ class Response(Part):
     """How every vehicle responds to set-points. The control is designed for it.
 
     A vehicle's velocity loop demands the acceleration w = a_set + gain (v_set - v); its acceleration a follows w by one
-    of three models. Without this part, model and values are identified in a manoeuvre before the formation flight.
+    of three models. The station sends v_set' = a_set. Without this part, model and values are identified in a manoeuvre
+    before the formation flight.
 
     lag                 lag a'(t) = w(t) - a(t)
     lag with dead time  lag a'(t) = w(t - dead time) - a(t)
