@@ -177,7 +177,7 @@ def flyable(file: Path, design: "Design", plan: "FlightPlan", *, allow_unstable:
     design, flown = planner.over_own_links(design, plan)
     if flown.margins_s != plan.margins_s:
         own, alike = ms_text(flown.delay_margin_s), ms_text(plan.delay_margin_s)
-        finding = f"the margin is {own} for the slowest of them, {alike} if delays were alike"
+        finding = f"the least margin is {own}, and {alike} if delays were alike"
         warn(file, f"vehicles share a loop, and their loop delays differ: {finding}")
     return design, flown
 
