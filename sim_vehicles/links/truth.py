@@ -8,7 +8,6 @@ import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +42,7 @@ channel. `fate` combines the bits in FATES. With one of DROPPED it never left: d
 duplicated datagram has two records; the copy's has DUPLICATE.
 PUSHED, CARRIED: from `time_ns` on the vehicle is pushed by an acceleration, or carried at a velocity. POSITION_ERROR,
 VELOCITY_ERROR: the state sampled with time_boot_ms `key` was reported with this error. In all four, `entered_ns` and
-`due_ns` hold the north and east components times 1e9, in the units of `disturbances`, which reads them.
+`due_ns` hold the north and east components in m/s², m/s, m and m/s, times 1e9.
 """
 
 _OLDER = np.dtype([(name, "u1" if name == "system_id" else DTYPE[name]) for name in DTYPE.names or ()])
@@ -180,17 +179,8 @@ class TruthLog(Recorder):
 
 
 def disturbance_row(kind: int, system_id: int, key: int, time_ns: int, north: float, east: float) -> Row:
-    """The record of a disturbance, PUSHED to VELOCITY_ERROR, whose components are in the units of `disturbances`."""
+    """The record of a disturbance, PUSHED to VELOCITY_ERROR, with its components in m/s², m/s or m."""
     return kind, system_id, key, time_ns, round(north * _PARTS), round(east * _PARTS)
-
-
-def disturbances(truth: npt.NDArray[np.void], kind: int, system_id: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Times (ns), shape (k,), and components north and east, shape (k, 2), of a vehicle's disturbances of one kind.
-
-    PUSHED in m/s², CARRIED in m/s, POSITION_ERROR in m, VELOCITY_ERROR in m/s.
-    """
-    own = truth[(truth["kind"] == kind) & (truth["system_id"] == system_id)]
-    return own["time_ns"], np.stack([own["entered_ns"], own["due_ns"]], axis=1) / _PARTS
 
 
 def read_truth(path: Path) -> npt.NDArray[np.void]:

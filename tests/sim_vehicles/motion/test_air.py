@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 from scenarios.kernel import at_row
 from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
 from scenarios.schema import Autopilot, Limits, Scenario
-from sim_vehicles.links.truth import POSITION_ERROR, PUSHED, VELOCITY_ERROR, MemoryRecorder, disturbances
+from sim_vehicles.links.truth import POSITION_ERROR, PUSHED, VELOCITY_ERROR, MemoryRecorder
 from sim_vehicles.motion import air, copter
 from sim_vehicles.motion.double_integrator import Command, State, bounds_of, move_under_push, state_from
 from sim_vehicles.motion.navigation import Navigator
@@ -18,6 +18,12 @@ from tests.support.sim_client import SECOND, START, scenario
 GUSTS = Gusts(deviation_m_s2=0.5, correlation_time_s=0.2)
 PUSH_ON_AT = at_row(move_under_push)
 UNLIMITED = bounds_of(Limits())
+
+
+def disturbances(recorder: MemoryRecorder, kind: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times (ns) and components, north and east, of the disturbances of one kind of vehicle 1."""
+    own = recorder.records[(recorder.records["kind"] == kind) & (recorder.records["system_id"] == 1)]
+    return own["time_ns"], np.stack([own["entered_ns"], own["due_ns"]], axis=1) * 1e-9
 
 
 def disturbed(count: int = 1, **parts: object) -> Scenario:
@@ -66,13 +72,13 @@ def test_constant_push_adds_to_the_command_as_in_closed_form() -> None:
     )
     assert reached[:2] == pytest.approx((40.0 * 4 + 0.5 * 1.5 * 16 + 6.0, 9.0 * 4 - 0.5 * 0.2 * 16 - 8.0), rel=1e-12)
     assert reached.velocity_ne_m_s() == pytest.approx((46.0, 8.2), rel=1e-12)
-    assert disturbances(recorder.records, PUSHED, 1)[1].tolist() == [[0.5, pytest.approx(0.3)]]
+    assert disturbances(recorder, PUSHED)[1].tolist() == [[0.5, pytest.approx(0.3)]]
 
 
 def test_the_truth_log_holds_the_gusts_that_moved_the_vehicle() -> None:
     recorder = MemoryRecorder()
     reached = moved(disturbed(gusts=GUSTS), START + SECOND, recorder)
-    times_ns, pushes = disturbances(recorder.records, PUSHED, 1)
+    times_ns, pushes = disturbances(recorder, PUSHED)
     assert np.diff(times_ns).tolist() == [air.STEP_NS] * 99
     wanted = np.array([40.0 + 1.0, 9.0 - 0.5]) + 0.01 * pushes.sum(axis=0)
     assert reached.velocity_ne_m_s() == pytest.approx(wanted, abs=1e-8)  # the log rounds to 1e-9 m/s²
@@ -107,7 +113,7 @@ def test_reports_are_wrong_by_the_noise_and_bias_asked_for() -> None:
     assert off.std(axis=0) == pytest.approx(np.array([[0.74**0.5] * 2, [0.2] * 2]), rel=0.06)
     next_to = (off[1:, 0] * off[:-1, 0]).mean()
     assert next_to == pytest.approx(0.49 * np.exp(-0.2), rel=0.1)
-    logged = [disturbances(recorder.records, kind, 1)[1] for kind in (POSITION_ERROR, VELOCITY_ERROR)]
+    logged = [disturbances(recorder, kind)[1] for kind in (POSITION_ERROR, VELOCITY_ERROR)]
     assert np.allclose(np.stack(logged, axis=1), off, rtol=0.0, atol=1e-9)
 
 
