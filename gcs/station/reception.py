@@ -194,7 +194,7 @@ class Reception:
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
                     if vehicle.is_elsewhere(datagram.address, datagram.received_ns) and row not in self._doubled:
                         self._doubled.add(row)
-                        self._report("vehicle", "has a second sender, whose frames are refused", vehicle.system_id)
+                        self._report("link", "has a second sender, whose frames are refused", vehicle.system_id)
                     continue
                 vehicle.address = datagram.address
                 self._report("vehicle", "found", vehicle.system_id)
