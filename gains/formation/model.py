@@ -151,11 +151,7 @@ class FormationModel:
         return self.A, self.feedback(self.overlapping_gain(K1, K2, K3))
 
     def feedback(self, K: FloatArray) -> FloatArray:
-        """B K, (states, states), for a gain K (inputs, states): its rows, placed. Large formations multiply slowly.
-
-        >>> FormationModel((-1, 0), axes=1).feedback(np.array([[-3.0, 0.0, 0.0], [2.0, 1.0, -3.0]])).tolist()
-        [[-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 1.0, -3.0]]
-        """
+        """B K, (states, states), for a gain K (inputs, states). Its rows are placed: large matrices multiply slowly."""
         product = np.zeros((self.states, self.states))
         product[~self.spacing_mask] = K
         return product

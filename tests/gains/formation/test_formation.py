@@ -125,3 +125,10 @@ def test_a_gain_of_another_kind_is_refused_by_name(gain: np.ndarray, message: st
 def test_the_leader_has_no_spacing_error() -> None:
     with pytest.raises(BadModelError, match="leader"):
         FormationModel((-1, 0)).spacing_slice(0)
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_feedback_is_the_product_of_b_and_k(axes: int) -> None:
+    model = FormationModel((-1, 0, 0, 2), axes)
+    K = np.random.default_rng(1).standard_normal((model.inputs, model.states))
+    assert np.array_equal(model.feedback(K), model.B @ K)

@@ -189,7 +189,7 @@ def test_a_companion_takes_no_vehicles_place() -> None:
     assert station.counters == {"other component": 2}
 
 
-def test_a_position_that_is_not_finite_is_refused_but_not_lost() -> None:
+def test_a_nan_position_is_refused_but_not_lost() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = station.vehicles[1]
     said = [peer.heartbeat(S)]

@@ -421,7 +421,7 @@ def test_positions_that_have_stopped_are_not_measured(stopped_s: float, status: 
     assert [figures.status for figures in watch.figures(now_ns, None)] == [status]
 
 
-def test_positions_that_are_not_finite_are_left_out_but_not_lost() -> None:
+def test_positions_that_are_not_finite_are_refused_but_not_lost() -> None:
     watch, peer = Watch([1]), Peer(1)
     for tick in range(100):
         now_ns = 100 * START_NS + 50 * MS * tick
