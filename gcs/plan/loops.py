@@ -180,13 +180,13 @@ def plan_over_links(plan: FlightPlan) -> FlightPlan:
         return plan
     margins_s = margins_over_links_s(plan)
     shared_s = {} if margins_s is None else _own_margins_s(plan)
-    own_s = {**plan.own_margins_s, **_margins_alike_s(plan), **shared_s}
+    own_s = {**plan.own_margins_s, **_margins_by_loop_s(plan), **shared_s}
     if (margins_s is None or margins_s == plan.margins_s) and own_s == plan.own_margins_s:
         return plan
     return replace(plan.with_margins(margins_s or plan.margins_s, plan.responses), own_margins_s=own_s)
 
 
-def _margins_alike_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
+def _margins_by_loop_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
     """Delay margins (s) with each of the plan's gains, by row, of the vehicles whose loop has one loop delay.
 
     They are only for formations on the ground loop whose links differ: a slow link then uses up the margin of its own
