@@ -187,14 +187,15 @@ def plan_over_links(plan: FlightPlan) -> FlightPlan:
 
 
 def _margins_by_loop_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """Delay margins (s) with each of the plan's gains, by row, of the vehicles whose loop has one loop delay.
+    """Delay margins (s) with each of the plan's gains, by row, of the vehicles in loops that have one loop delay.
 
-    They are only for formations on the ground loop whose links differ: a slow link then uses up the margin of its own
-    loop, not that of the loop with the least. Empty if no such vehicle has more than the formation's.
+    Only for ground loops whose links differ: a slow link then uses up the margin of its own loop, not the least of all
+    loops. Empty if no such vehicle has a larger margin than the formation.
     """
-    control, delays_s = plan.scenario.control, planned_loop_delays_s(plan)
+    control = plan.scenario.control
     if control.loop == "onboard" or control.prediction != "off" or not is_modelled(plan):
         return {}
+    delays_s = planned_loop_delays_s(plan)
     if len(set(delays_s.values())) == 1:
         return {}
     own_s, known_s = dict[int, list[float]](), dict[Hashable, float]()

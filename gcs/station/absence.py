@@ -24,7 +24,7 @@ def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
 GROUNDED = (HAS_LANDED, WAS_DISARMED)
 """Why a vehicle on the ground is absent; others may fly over it."""
 PILOTED = (TAKEN_OVER, *GROUNDED)
-"""Why a vehicle is absent that its pilot flies, or has landed or disarmed."""
+"""Why a vehicle is absent if its pilot flies it, or has landed or disarmed it."""
 
 
 def off_the_ground(controls: Records, absent: Sequence[str]) -> Records:

@@ -117,8 +117,8 @@ class Reception:
         """Number of refused frames, by reason."""
         self.touched: set[int] = set()
         """Rows of vehicles that have sent something kernels do not handle since `touched` was last cleared."""
-        self._doubled: set[int] = set()
-        """Rows of vehicles of which a second sender is reported."""
+        self._claimed_twice: set[int] = set()
+        """Rows of vehicles whose second sender has been reported."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
@@ -192,8 +192,8 @@ class Reception:
             if vehicle.address != datagram.address:
                 if not vehicle.accepts_address(datagram.address, frame.msg_id, datagram.received_ns):
                     self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
-                    if vehicle.is_elsewhere(datagram.address, datagram.received_ns) and row not in self._doubled:
-                        self._doubled.add(row)
+                    if vehicle.is_elsewhere(datagram.address, datagram.received_ns) and row not in self._claimed_twice:
+                        self._claimed_twice.add(row)
                         self._report("link", "has a second sender, whose frames are refused", vehicle.system_id)
                     continue
                 vehicle.address = datagram.address
