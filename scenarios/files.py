@@ -345,7 +345,7 @@ def _sector_contradictions(scenario: Scenario) -> Iterator[Fault]:
 
 
 def _velocity_contradictions(scenario: Scenario) -> Iterator[Fault]:
-    on_ground = scenario.dynamics == "autopilot"
+    on_ground = scenario.starts_on_ground
     lowest = 0.0 if on_ground else scenario.limits.speed_min_m_s  # multicopters can stand
     highest = scenario.limits.speed_max_m_s or math.inf
     wanted_speed = f"a speed within the limits, {lowest:g} to {highest:g} m/s"

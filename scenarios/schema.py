@@ -413,6 +413,11 @@ class Scenario(Part):
         return min(self.rates.target_hz, self.rates.telemetry_hz)
 
     @property
+    def starts_on_ground(self) -> bool:
+        """Whether the vehicles take off: those with an autopilot do, all others are launched in the air."""
+        return self.dynamics == "autopilot"
+
+    @property
     def has_altitude_slots(self) -> bool:
         """Whether vehicles fly at different altitudes."""
         return len({self.altitude_of(vehicle) for vehicle in self.vehicles}) > 1

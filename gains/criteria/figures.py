@@ -140,7 +140,7 @@ class LoopFigures(DelayFreeFigures):
     @property
     def is_stable_at_delay(self) -> bool:
         """Whether the loop is stable at the delay; in searches by its margin if that is known already."""
-        shared = self.thinned > 1 and not self.discrete and self.timing.loop == "ground"
+        shared = self.thinned > 1 and not self.discrete and self.timing.all_late
         known_s = vars(self).get("delay_margin_s", 0.0) if shared else 0.0
         return known_s > (self.delay_s or 0.0) or self.decay_rate_at_delay_1_s > 0.0
 

@@ -60,7 +60,12 @@ class FlownTiming:
     def delays_s(self, delay_s: float) -> tuple[float, float]:
         """Delays (s) of a vehicle's own errors and of those of others at a loop delay (s), including holds."""
         late_s = delay_s + self.period_s / 2.0
-        return (self.step_s / 2.0 if self.loop == "onboard" else late_s), late_s
+        return (late_s if self.all_late else self.step_s / 2.0), late_s
+
+    @property
+    def all_late(self) -> bool:
+        """Whether all feedback acts after the loop delay; on board, a vehicle's own errors do not."""
+        return self.loop == "ground"
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +208,7 @@ class FlownLoop:
             return 0.0
         at_rest_s = (
             own_s - hold_s + spare / (2 * k2 * k3)
-            if peak == 1.0 and self.timing.loop == "onboard" and k2 > _NOTHING * k1
+            if peak == 1.0 and not self.timing.all_late and k2 > _NOTHING * k1
             else inf
         )
         slowest = min(k1, k3**0.5, k3 / k1)
@@ -221,7 +226,7 @@ class FlownLoop:
         # difference of |N|² and peak² |D|² apart from the rotating part, exact for small ω
         flat = (level - 1.0) * k3**2 + x * ((level - 1.0) * k1**2 + spare + 2 * k3)
         own = (1j * k1 * omega + k3) * h
-        if self.timing.loop == "ground":
+        if self.timing.all_late:
             still, turning, sign = -x + 0j, own, 1.0
             excess = -(flat * power / level + x**2)
         else:

@@ -111,12 +111,13 @@ def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargi
         wanted = way if design.margin_unknown == OWN_DYNAMICS else design.margin_unknown
         raise ModelFileError(f"{file}: read {read} without a linear model of its loop, wanted {wanted}")
     model, loop = plan.model, plan.scenario.control.loop
-    at_once = own_part(model, plan.gain) if loop == "onboard" else np.zeros_like(plan.gain)
+    what, at_once = "all feedback late", np.zeros_like(plan.gain)
+    if plan.onboard is not None:
+        what, at_once = "own errors at once, those of others late", own_part(model, plan.gain)
     terms = Term(model.A + model.B @ at_once, 0.0, Fraction(0)), Term(model.B @ (plan.gain - at_once), 0.0, Fraction(1))
     found = loop_margin(DelayModel(terms, "tau"))
     assert isinstance(found, LoopMargin)
     sampled_s = design.delay_margin_s
-    what = "own errors at once, those of others late" if loop == "onboard" else "all feedback late"
     flown = "no limit" if sampled_s is None else f"margin {sampled_s:.6g} s"
     note = f"as flown, sampled and held every {design.period_s * 1e3:g} ms: {flown}"
     if design.prediction is not None:

@@ -203,7 +203,7 @@ def _refuse_vehicle(system_id: int, study: "Study", given: list[tuple[str, str]]
     if given:
         raise InputError(f"read --onset-of and {given[0][0]}, wanted one of them")
     shared = next(loop.system_ids for loop in plan_loops(study.plan) if system_id in loop.system_ids)
-    if len(shared) > 1 and (study.real_time or study.plan.scenario.control.loop == "onboard"):
+    if len(shared) > 1 and (study.real_time or study.plan.onboard is not None):
         place = "with --real-time" if study.real_time else "with loops on board"
         alone = f"a vehicle that shares its loop with no other (vehicles {' '.join(map(str, shared))} share one)"
         flown = "" if study.real_time else f"; --delay-of {system_id}=FROM:TO:N flies its link delays"

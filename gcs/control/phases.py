@@ -46,7 +46,7 @@ _ROUND_TRIPS = 40.0
 
 def patience_s(scenario: Scenario) -> float:
     """Timeout for a flight to begin. Until it begins, scenario time is the time since the start minus this."""
-    least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else _LAUNCHED_PATIENCE_S
+    least_s = START_PATIENCE_S if scenario.starts_on_ground else _LAUNCHED_PATIENCE_S
     return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
 
 

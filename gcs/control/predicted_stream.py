@@ -25,7 +25,7 @@ from gains.sampled.onboard import own_part, streamed_loop
 from gcs.control.history import Reports, State
 from gcs.control.law import FeedbackLaw
 from gcs.control.prediction import KEPT_S, Delivery, FirstUses, FixedDelivery
-from gcs.plan.flight_plan import FlightPlan, onboard_timing
+from gcs.plan.flight_plan import FlightPlan
 from scenarios.schema import NS_PER_S
 
 _GRID_S = 1e-3
@@ -36,7 +36,7 @@ class StreamPrediction:
     """The commands sent to each vehicle, and the formation state predicted from them."""
 
     def __init__(self, plan: FlightPlan, deliveries: Sequence[Delivery]) -> None:
-        model, timing = plan.model, onboard_timing(plan.scenario)
+        model, timing = plan.model, plan.onboard
         assert timing is not None
         A, B, _ = streamed_loop(model, plan.gain, timing)
         own = own_part(model, plan.gain)

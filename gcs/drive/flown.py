@@ -83,7 +83,7 @@ def identified_in_flight(plan: FlightPlan) -> FlightPlan:
     A plan whose responses are given, or whose vehicles respond at once, is returned unchanged. Raises InputError with
     the reason if the formation flight does not begin.
     """
-    if plan.responses is not None or plan.scenario.dynamics != "autopilot":
+    if plan.response_is_known:
         return plan
     station = Station(plan, start_ns=START_NS)
     for _ in fly_lockstep(plan, station=station):
@@ -160,10 +160,10 @@ def effective_delays_s(
     """For each vehicle, the constant loop delay equivalent to those of its commands in these rows."""
     truth = flight.truth
     assert truth is not None
-    on_board, held_s = plan.scenario.control.loop == "onboard", plan.timing.held_s
+    held_s = plan.timing.held_s
 
     def commands(system_id: int) -> IntArray:
-        if not on_board:
+        if plan.onboard is None:
             return commands_of(rows, truth, system_id)
         whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
         return commands_on_board(whole, truth, system_id)

@@ -74,7 +74,7 @@ def _is_predicted(design: Design) -> bool:
 
 def _predicted_followers(design: Design, delay_s: float, gain_set: int) -> list[PredictedFigures]:
     """The followers of a loop with prediction or feed-forward; known only for inclusion gains on the ground."""
-    if design.inclusion_gains is None or design.loop != "ground":
+    if design.inclusion_gains is None or design.onboard is not None:
         return []
     assumed_s = 0.0
     if design.prediction is not None:

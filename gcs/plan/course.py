@@ -181,8 +181,10 @@ def nearest_planned(scenario: Scenario) -> Nearest | None:
 
 def _time_of(share: float) -> float:
     """The x at which `smooth_step` reaches a share of its rise, by bisection."""
+    if share == 0.0:
+        return 0.0
     low, high = 0.0, 1.0
     for _ in range(40):
         middle = (low + high) / 2.0
         low, high = (middle, high) if smooth_step(middle)[0] < share else (low, middle)
-    return high if share else 0.0
+    return high

@@ -41,7 +41,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
         alpha_at_delay=figures.alpha_at_delay,
         decay_rate_at_delay_1_s=figures.decay_rate_at_delay_1_s,
         spacing_gain_s2=plain(figures.spacing_gain_max_s2),
-        noise_gain=plain(figures.noise_gain_max) if design.loop == "ground" else None,
+        noise_gain=plain(figures.noise_gain_max) if figures.timing.all_late else None,
         weight=figures.weight or (1.0, 1.0),
     )
 
@@ -50,7 +50,7 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
     """The design with the criteria that take long to compute: the bound on α for any controller, and varying delays."""
     design = with_criteria(design, scenario, most_states=inf) if design.criteria is None else design
     figures, found = _figures(design, scenario), design.criteria
-    if figures is None or found is None or design.loop == "onboard":
+    if figures is None or found is None or not figures.timing.all_late:
         return design
     more: dict[str, object] = {}
     period_s, keys = figures.timing.period_s, scenario.control.criteria

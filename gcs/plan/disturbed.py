@@ -75,7 +75,7 @@ def disturbed_formation(
     """The loop of a design and its disturbances, at one loop delay (s) for all vehicles or one for each."""
     air, navigation, rates, control = scenario.disturbance, scenario.navigation, scenario.rates, scenario.control
     K = _gain(design, formation.model)
-    if (air is None and navigation is None) or K is None or control.loop == "onboard":
+    if (air is None and navigation is None) or K is None or design.onboard is not None:
         return None
     if (air is not None and air.sector is not None) or rates.control_hz != rates.telemetry_hz:
         return None
@@ -114,7 +114,7 @@ def _whole(design: Design, plan: FlightPlan, delay_s: float) -> WholeFigures | N
         design.margin_unknown
         or design.inclusion_gains is None
         or not 2 <= design.vehicles <= _MOST_WHOLE
-        or design.loop == "onboard"
+        or design.onboard is not None
         or design.response is not None
     ):
         return None

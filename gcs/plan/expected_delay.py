@@ -62,7 +62,7 @@ def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
 
 def _heard(plan: FlightPlan) -> dict[int, set[int]]:
     """The vehicles whose states each streamed command needs, two for a spacing error; empty for the ground loop."""
-    if plan.scenario.control.loop == "ground":
+    if plan.onboard is None:
         return {}
     model, ids = plan.model, plan.formation.system_ids
     streamed, heard = plan.gain - own_part(model, plan.gain), {own: set[int]() for own in ids}

@@ -102,8 +102,7 @@ class FlightPlan:
 
     def predicted(self, K: FloatArray) -> Predicted:
         """The predicted formation with one of the gains."""
-        timing, onboard = self.timing, onboard_timing(self.scenario)
-        return Predicted(self.model, K.tobytes(), timing, self.responses_in_order, onboard)
+        return Predicted(self.model, K.tobytes(), self.timing, self.responses_in_order, self.onboard)
 
     @property
     def assumed_s(self) -> float | None:
@@ -119,6 +118,24 @@ class FlightPlan:
     def timing(self) -> Timing:
         """The periods of control and telemetry."""
         return loop_timing(self.scenario)
+
+    @property
+    def onboard(self) -> OnboardTiming | None:
+        """The timing of the onboard loop; None if the station closes every loop."""
+        return onboard_timing(self.scenario)
+
+    @property
+    def all_late(self) -> bool:
+        """Whether all feedback acts after the loop delay: x' = A x + B K x(t - tau).
+
+        It does not with a loop on board, which closes part of it at once, nor with prediction.
+        """
+        return self.onboard is None and self.scenario.control.prediction == "off"
+
+    @property
+    def response_is_known(self) -> bool:
+        """Whether the vehicles' response is immediate, given, or identified: that of an autopilot is, in flight."""
+        return self.responses is not None or not self.scenario.starts_on_ground
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
         """The plan with the margins that the same gains have on vehicles with these responses."""

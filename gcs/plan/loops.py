@@ -12,7 +12,7 @@ from math import inf, isnan, nan
 from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.plan.expected_delay import planned_loop_delays_s
-from gcs.plan.flight_plan import FlightPlan, onboard_timing
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
 
@@ -37,7 +37,7 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
         plan.gain,
         plan.formation.system_ids,
         timing=plan.timing,
-        onboard=onboard_timing(plan.scenario),
+        onboard=plan.onboard,
         assumed_s=plan.assumed_s,
         responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
         response_states=() if responses is None else response_states(plan.model, responses),
@@ -131,7 +131,8 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 
     Always false with prediction, without a model, and for more vehicles than are searched.
     """
-    if plan.scenario.control.prediction != "off" or not is_modelled(plan) or len(block.system_ids) > _MOST_SHARING:
+    is_searched = plan.scenario.control.prediction == "off" and is_modelled(plan)
+    if not is_searched or not 1 < len(block.system_ids) <= _MOST_SHARING:
         return False
     delays_s = planned_loop_delays_s(plan)
     return len({delays_s[own] for own in block.system_ids}) > 1
@@ -172,66 +173,62 @@ def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
 
 
 def plan_over_links(plan: FlightPlan) -> FlightPlan:
-    """The plan with its margins over the scenario's links.
+    """The plan with its margins over the scenario's links, of the formation and of single vehicles.
 
-    Returns the plan itself if the margins for equal delays apply, or if responses of vehicles are not known yet.
+    Returns the plan itself where they are the margins for equal delays, or where no model predicts its loops yet.
     """
-    if plan.scenario.dynamics == "autopilot" and plan.responses is None:
-        return plan
-    margins_s = margins_over_links_s(plan)
-    shared_s = {} if margins_s is None else _own_margins_s(plan)
-    own_s = {**plan.own_margins_s, **_margins_by_loop_s(plan), **shared_s}
-    if (margins_s is None or margins_s == plan.margins_s) and own_s == plan.own_margins_s:
-        return plan
-    return replace(plan.with_margins(margins_s or plan.margins_s, plan.responses), own_margins_s=own_s)
-
-
-def _margins_by_loop_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """Delay margins (s) with each of the plan's gains, by row, of the vehicles in loops that have one loop delay.
-
-    Only for ground loops whose links differ: a slow link then uses up the margin of its own loop, not the least of all
-    loops. Empty if no such vehicle has a larger margin than the formation.
-    """
-    control = plan.scenario.control
-    if control.loop == "onboard" or control.prediction != "off" or not is_modelled(plan):
-        return {}
     delays_s = planned_loop_delays_s(plan)
-    if len(set(delays_s.values())) == 1:
-        return {}
-    own_s, known_s = dict[int, list[float]](), dict[Hashable, float]()
-    for number, each in enumerate(replace(plan, gain=K) for K in plan.gains):
-        for block in plan_loops(each):
-            if len({delays_s[own] for own in block.system_ids}) > 1:
-                continue
-            key = number, block.kind
-            if key not in known_s:
-                known_s[key] = block.margin_s()
-            for own in block.system_ids:
-                own_s.setdefault(plan.formation.row(own), []).append(known_s[key])
-    found = {row: tuple(own) for row, own in own_s.items() if len(own) == len(plan.gains)}
-    return found if any(own[0] > plan.delay_margin_s for own in found.values()) else {}
+    known = plan.response_is_known and is_modelled(plan) and plan.scenario.control.prediction == "off"
+    if not known or len(set(delays_s.values())) == 1:
+        return plan
+    every = [_over_links(replace(plan, gain=K)) for K in plan.gains]
+    own_s = {row: tuple(margins_s[row] for _, margins_s in every) for row in every[0][1]}
+    shared_s = [formation_s for formation_s, _ in every if formation_s is not None]
+    if not shared_s and all(own[0] <= plan.delay_margin_s for own in own_s.values()):
+        return plan
+    if shared_s:
+        plan = plan.with_margins(tuple(shared_s), plan.responses)
+    return replace(plan, own_margins_s={**plan.own_margins_s, **own_s})
 
 
-def _own_margins_s(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """Delay margins (s) of single vehicles with each of the plan's gains, by row, all other links as in the scenario.
+def _over_links(plan: FlightPlan) -> tuple[float | None, dict[int, float]]:
+    """The margin (s) over the scenario's links of the formation, and those of single vehicles by row.
 
-    They are only for vehicles that share a loop on the ground over different links. The slowest vehicle keeps the
-    margin of its loop over these links if that is smaller, and all its vehicles keep it if the links already exceed it.
+    The formation's is that of its least stable loop, at its slowest vehicle; None if no loop is shared over different
+    links, and the margin for equal delays applies. Single vehicles have one of their own only if all feedback is late:
+    a slow link then uses up the margin of its own loop, not the least of all loops.
     """
-    expected_s, own_s = planned_loop_delays_s(plan), dict[int, list[float]]()
-    for each in (replace(plan, gain=K) for K in plan.gains):
-        for block in plan_loops(each):
-            if block.extrapolated is None or not links_differ(each, block):
-                continue
-            slowest = max(block.system_ids, key=expected_s.__getitem__)
-            margin_s = expected_s[slowest] * breaking_factor(each, block)
-            for own in block.system_ids:
-                found = margin_s
-                if margin_s > expected_s[slowest]:
-                    alone_s = window_of(each, own, quick=True)[1]
-                    found = min(margin_s, alone_s) if own == slowest else alone_s
-                own_s.setdefault(plan.formation.row(own), []).append(found)
-    return {row: tuple(found) for row, found in own_s.items() if len(found) == len(plan.gains)}
+    delays_s, least_s, any_differs = planned_loop_delays_s(plan), inf, False
+    own_s, known_s = dict[int, float](), dict[Hashable, float]()
+    for block in plan_loops(plan):
+        differs = links_differ(plan, block)
+        if differs:
+            slowest_s = max(delays_s[own] for own in block.system_ids)
+            margin_s = slowest_s * breaking_factor(plan, block)
+            found = _shared_margins_s(plan, block, margin_s) if plan.all_late else {}
+        else:
+            if block.kind not in known_s:
+                known_s[block.kind] = block.margin_s()
+            margin_s = known_s[block.kind]
+            alike = len({delays_s[own] for own in block.system_ids}) == 1
+            found = dict.fromkeys(block.system_ids, margin_s) if plan.all_late and alike else {}
+        least_s, any_differs = min(least_s, margin_s), any_differs or differs
+        own_s |= {plan.formation.row(own): own_margin_s for own, own_margin_s in found.items()}
+    return least_s if any_differs else None, own_s
+
+
+def _shared_margins_s(plan: FlightPlan, block: CoupledBlock, margin_s: float) -> dict[int, float]:
+    """Margins (s) of single vehicles in a loop shared over different links, all other links as in the scenario.
+
+    The slowest vehicle keeps the margin of its loop over these links if that is smaller, and all vehicles keep it if
+    the links already exceed it.
+    """
+    delays_s = planned_loop_delays_s(plan)
+    slowest = max(block.system_ids, key=delays_s.__getitem__)
+    if margin_s <= delays_s[slowest]:
+        return dict.fromkeys(block.system_ids, margin_s)
+    own_s = {own: window_of(plan, own, quick=True)[1] for own in block.system_ids}
+    return own_s | {slowest: min(margin_s, own_s[slowest])}
 
 
 def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:

@@ -153,10 +153,10 @@ def proved_jump_s(flown: Predicted, assumed_s: float) -> float | None:
 
 def assumption(scenario: Scenario) -> str:
     """What the prediction assumes about the set-points sent, as one line; empty without prediction."""
-    as_sent, on_board = "every set-point acts as it was sent", scenario.control.loop == "onboard"
+    as_sent = "every set-point acts as it was sent"
     if scenario.control.prediction == "off":
         return ""
     if scenario.target_hz > 0.0:
         return f"where vehicles do not report their active targets, {as_sent}"
-    why = "those of own loops do not show it" if on_board else "rates.target_hz is 0"
+    why = "rates.target_hz is 0" if scenario.rates.target_hz == 0.0 else "those of own loops do not show it"
     return f"{as_sent}: no active targets are asked for, as {why}"

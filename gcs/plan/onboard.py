@@ -16,7 +16,7 @@ from gains.performance.behaviour import behaviour
 from gains.sampled.onboard import onboard_loop, own_part, streamed_loop
 from gcs.errors import InputError
 from gcs.plan.design import Behaviour, Design, GainSet, OnboardPart
-from gcs.plan.flight_plan import FlightPlan, onboard_timing
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 
 AXES = "NE"
@@ -31,7 +31,7 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     the schedule keep the vehicles' own gains and reduce the share of the stream. Without any stream the formation is
     stable at every delay. It flies without a stream while a vehicle is lost, if vehicles share loops.
     """
-    timing = onboard_timing(plan.scenario)
+    timing = plan.onboard
     assert timing is not None
     own = own_part(plan.model, plan.gain).astype(np.float32).astype(np.float64)
     others = plan.gain - own_part(plan.model, plan.gain)

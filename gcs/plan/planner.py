@@ -169,7 +169,7 @@ def with_trade_off(design: Design) -> Design:
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the loop as flown, from those of its ground loop, with the figures at its delay."""
-    if plan.scenario.control.loop == "onboard":
+    if plan.onboard is not None:
         design, plan = onboard_plan(design, plan)
         plan = replace(plan, own_margins_s=unlimited(plan))
         design = _with_own_margins(design, plan)
@@ -200,7 +200,7 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 
 
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
-    if responses is None and plan.scenario.dynamics == "autopilot":
+    if responses is None and not plan.response_is_known:
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # the case that the design was computed for
         return whole, plan

@@ -190,7 +190,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         course=_course(scenario) if scenario.course.is_smooth else None,
         planned=tuple(_planned(scenario, formation)) if scenario.manoeuvres else (),
         vehicles=tuple(vehicles),
-        response_known=scenario.dynamics != "autopilot" or plan.responses is not None,
+        response_known=plan.response_is_known,
         response_differs=_response_differs(scenario),
         **({"code": code_by_key(scenario)} if scenario.code else {}),
     )

@@ -18,7 +18,7 @@ from gcs.errors import beyond
 from gcs.link.clocks import REQUEST_LIFETIME_NS
 from gcs.plan.course import nearest_planned
 from gcs.plan.expected_delay import expected_loop_delay_s
-from gcs.plan.flight_plan import FlightPlan, onboard_timing
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -64,7 +64,7 @@ def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:
 
 
 def _sampled_growth_1_s(plan: FlightPlan) -> float:
-    timing = onboard_timing(plan.scenario)
+    timing = plan.onboard
     if timing is not None:
         return onboard_loop(plan.model, plan.gain, timing).growth_1_s(0.0)
     return growth_rate(*_matrices(plan), period_s=1.0 / plan.scenario.rates.control_hz, delay_s=0.0)
@@ -85,7 +85,7 @@ def bad_start(scenario: Scenario) -> str | None:
     """
     safety, vehicles, offset_ne_m = scenario.safety, scenario.leader_first(), plan_formation(scenario).offset_ne_m
     for one, two in combinations(vehicles, 2):
-        above_m = scenario.altitude_of(one) - scenario.altitude_of(two) if scenario.dynamics != "autopilot" else 0.0
+        above_m = scenario.altitude_of(one) - scenario.altitude_of(two) if not scenario.starts_on_ground else 0.0
         apart_m = hypot(dist(one.position_ne_m, two.position_ne_m), above_m)
         if apart_m < safety.collision_distance_m:
             least_m = safety.collision_distance_m

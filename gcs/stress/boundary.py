@@ -118,7 +118,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     board and, with prediction, loops over the measured delay, of several vehicles, or over reordering links.
     """
     scenario, names = study.plan.scenario, [axis.name for axis in axes]
-    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or scenario.control.loop != "ground":
+    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or study.plan.onboard is not None:
         return None
     jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
@@ -185,9 +185,8 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     Empty for other axes, for loops with feedback that is not delayed, and for vehicles that share a loop with others,
     because the delays of those matter too.
     """
-    plan, control = study.plan, study.plan.scenario.control
-    all_late = control.loop == "ground" and control.prediction == "off"  # x' = A x + B K x(t - tau)
-    if not all(axis.name.startswith("delay_") for axis in axes) or not all_late:
+    plan = study.plan
+    if not all(axis.name.startswith("delay_") for axis in axes) or not plan.all_late:
         return []
     ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):

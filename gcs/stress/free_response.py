@@ -150,7 +150,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     but those outside the leader's loop do not affect it.
     """
     scenario, place, duration_s = plan.scenario.in_steady_flight(), plan.formation.place_ne_m(), PROBE_S
-    if scenario.dynamics == "autopilot":
+    if scenario.starts_on_ground:
         scenario, duration_s = _at_rest(scenario), PROBE_S if plan.assumed_s is None else _HIDDEN_MODE_S
     if has_constant_links(scenario):
         scenario = scenario.model_copy(update={"clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})})
@@ -164,7 +164,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         if vehicle.system_id in system_ids:
             k = system_ids.index(vehicle.system_id)
             error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * _DIRECTION_NE
-            if vehicle is leader and scenario.dynamics == "autopilot":
+            if vehicle is leader and scenario.starts_on_ground:
                 still = NominalVelocity(from_s=0.0, velocity_ne_m_s=(-float(error[0]), -float(error[1])))
                 scenario = scenario.model_copy(update={"nominal_velocity": (still,)})
             elif vehicle is leader:
@@ -253,7 +253,7 @@ def past_limits(scenario: Scenario, own: TickArray) -> bool:
     most_m_s2 = np.minimum(
         limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * np.maximum(speed_m_s, 1e-9)
     )
-    slow = speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot")
+    slow = speed_m_s < limits.speed_min_m_s * (not scenario.starts_on_ground)
     fast = speed_m_s > (limits.speed_max_m_s or np.inf)
     return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
 

@@ -167,7 +167,7 @@ class Comparison(Published):
 def compared(design: Design, name: str) -> Comparison:
     """Compare prediction with none at a design's decay. InputError unless the design is by inclusion and stable."""
     answers = set(design.responses.values())
-    if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
+    if design.inclusion_gains is None or design.onboard is not None or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
         raise InputError(f"{name}: read another design, wanted {wanted}")
     K1, K2, K3 = (float(gain[0, 0]) for gain in design.inclusion_gains)

@@ -115,7 +115,7 @@ def _print_criteria(found: CriteriaPart, console: Console) -> None:
 
 def _print_margins(design: Design, console: Console) -> None:
     sampled_s, continuous_s = design.delay_margin_s, design.delay_margin_continuous_s
-    if design.loop == "onboard" and sampled_s is None:
+    if design.onboard is not None and sampled_s is None:
         console.print("margin   no limit: no delay of what the station streams makes this loop unstable")
     elif sampled_s == 0.0:
         console.print("margin   none: the sampled loop is unstable without any delay")

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from gcs import fly_virtual
 from gcs.cli.main import app
 from gcs.errors import InputError
-from gcs.plan.loops import margins_over_links_s, plan_loops
+from gcs.plan.loops import plan_loops, plan_over_links
 from gcs.plan.planner import flight_plan, over_own_links
 from gcs.preflight.check import check
 from gcs.stress.measure import fly_trial
@@ -135,9 +135,7 @@ def test_loops_on_board_break_at_their_margin_over_different_links() -> None:
     scenario = with_links(load(located("thesis_delay")), all=0.05, v1=0.3)
     study = study_of(scenario)
     assert study.plan.delay_margin_s == pytest.approx(1.0022, abs=1e-4)
-    margins_s = margins_over_links_s(study.plan)
-    assert margins_s is not None
-    margin_s = margins_s[0]
+    margin_s = plan_over_links(study.plan).delay_margin_s
     assert margin_s == pytest.approx(1.0402, abs=5e-4)  # flown: 1.0402
 
     def flown(share: float) -> float | None:
