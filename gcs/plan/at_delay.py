@@ -68,12 +68,12 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 
 def _is_predicted(design: Design) -> bool:
-    """Whether the loop predicts or feeds forward, which makes it one of `gains.criteria.predicted`."""
+    """Whether the loop predicts or feeds forward; `gains.criteria.predicted` then has its figures."""
     return design.prediction is not None or design.feed_forward > 0.0
 
 
 def _predicted_followers(design: Design, delay_s: float, gain_set: int) -> list[PredictedFigures]:
-    """The followers of a loop with prediction or feed-forward; known only for inclusion gains on the ground."""
+    """One follower's figures for each response, if predicted or fed forward; only for inclusion gains on the ground."""
     if design.inclusion_gains is None or design.onboard is not None:
         return []
     assumed_s = 0.0
@@ -96,7 +96,7 @@ def _predicted_followers(design: Design, delay_s: float, gain_set: int) -> list[
 
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
-    """The formations flown, none where no α is defined, and the loops of followers in a leader-follower tree."""
+    """The formations that have an α, and the loops of followers in a leader-follower tree; either may be empty."""
     entry = _gain_set(design, gain_set)
     if design.inclusion_gains is not None:
         chains = _follower_loops(design, entry)
@@ -135,6 +135,6 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
 
 
 def flown_timing(design: Design, margin_s: float | None = None) -> FlownTiming:
-    """The timing of a design's loop; `margin_s` as in design.json."""
+    """The timing of a design's loop; `margin_s` is None without a limit, as in design.json."""
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
     return FlownTiming(inf if margin_s is None else margin_s, design.period_s, design.loop, step_s)

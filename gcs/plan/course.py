@@ -5,7 +5,7 @@ Vehicle k is to fly
 
     r_k = integral of v_d + R b_k,    R = 1 with fixed offsets, the rotation by psi with offsets in the heading frame.
 
-`PlannedMotion` gives R b_k and its derivatives, and those of r_k. Only a flight that manoeuvres has one.
+`PlannedMotion` gives R b_k and the first two derivatives of r_k. Only flights that manoeuvre are controlled by one.
 """
 
 from bisect import bisect_right

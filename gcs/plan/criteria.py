@@ -21,7 +21,7 @@ _QUICK_STATES = 12
 
 
 def with_criteria(design: Design, scenario: Scenario, *, most_states: float = _QUICK_STATES) -> Design:
-    """The design with `criteria`, except those that take long; unchanged if it predicts or is unstable."""
+    """The design with its quick `criteria`; unchanged if it is unstable or too large, or `_figures` is None."""
     try:
         found = _found(design, scenario, most_states)
     except BadModelError:
@@ -47,7 +47,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
 
 
 def with_bounds(design: Design, scenario: Scenario) -> Design:
-    """The design with the criteria that take long to compute: the bound on α for any controller, and varying delays."""
+    """The design with the slow criteria as well: the bound on α for any controller, and those of varying delays."""
     design = with_criteria(design, scenario, most_states=inf) if design.criteria is None else design
     figures, found = _figures(design, scenario), design.criteria
     if figures is None or found is None or not figures.timing.all_late:
@@ -73,7 +73,8 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
 def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> dict[str, object]:
     """Names the bound that proves stability for all delays from `low_s` to `high_s`, and the delay up to which it does.
 
-    On patterns only the bound for a spread is tried: the matrix inequalities of the others take minutes.
+    For varying delays of more than two vehicles, only the spread bound is tried: the matrix inequalities of the others
+    take minutes.
     """
     hold_s, middle_s, spread_s = figures.timing.period_s / 2.0, (low_s + high_s) / 2.0, (high_s - low_s) / 2.0
     if figures.model.vehicles > 2 and rate > 0.0:
@@ -89,7 +90,7 @@ def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> di
 
 
 def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
-    """The figures of a design's fastest gains on one axis; None if the loop as flown is not of this kind."""
+    """Figures of a design's fastest gains on one axis; None with prediction, feed-forward, one vehicle or no margin."""
     if design.prediction is not None or design.feed_forward or design.vehicles < 2 or design.margin_unknown:
         return None
     known = [own.response for own in design.response.vehicles] if design.response else []

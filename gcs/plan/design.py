@@ -25,7 +25,7 @@ Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(plain)]
 
 
 class BlockMargin(Published):
-    """Continuous delay margin of one diagonal block, and the frequency at which it is lost; None if it never is."""
+    """Continuous delay margin of one diagonal block, and the frequency of instability there; None without a limit."""
 
     delay_margin_s: Margin
     crossing_rad_s: float | None
@@ -118,7 +118,7 @@ class OnboardPart(Published):
 
 
 class WindowAt(Published):
-    """Range of loop delays (s) in which a predicted loop is stable; the upper end is None if no delay is too long."""
+    """Range of loop delays (s) in which a loop with prediction is stable; the upper end is None without a limit."""
 
     assumed_delay_s: float
     mismatch_window_s: tuple[float, Margin]
@@ -154,7 +154,7 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     """The figures at the loop delay of the scenario's links, and the delays up to which they keep a limit."""
 
     alpha_kept: float | None = None
-    """None with prediction or feed-forward, for which these delays are not computed."""
+    """The limit on α. None with prediction or feed-forward, for which these fields are not computed."""
     alpha_kept_to_s: float | None = None
     """None if α is kept at every loop delay; the same for `string_peak_kept_to_s`."""
     string_peak_kept: float | None = None
@@ -200,7 +200,7 @@ class CriteriaPart(Published):
     noise_gain: float | None
     weight: tuple[float, float] = (1.0, 1.0)
     alpha_bound: float | None = None
-    """Upper bound of α for any controller at the delay. Only `gcs design` computes this and the fields below."""
+    """Upper bound on the α of any controller at the delay. Only `gcs design` computes this and the fields below."""
     delays_jumping_s: tuple[float, float] | None = None
     """Range around `at_delay_s` in which the loop delay may jump in any way."""
     delays_covered_by: str | None = None
@@ -224,7 +224,7 @@ class GainsAtDelay(Published):
     prediction: bool
     maximised: str = ""
     gains: Literal["fastest", "least", "own"] = "own"
-    """The `fastest` at the delay, the `least` that decay as fast with prediction, or the scenario's `own`."""
+    """The `fastest` at the delay, the `least` with prediction that decay as fast, or the scenario's `own`."""
     refused: str = ""
     """Why there are no gains; the figures are then unknown."""
     K1: float | None = None
@@ -258,14 +258,14 @@ class LinkPart(Published):
     loop_delay_s_worst: float
     headroom: float
     lost_share: float = 0.0
-    """The largest share of datagrams that a vehicle's link up lost; the link down is taken to lose as many."""
+    """Largest share of datagrams lost on any vehicle's up link; the down link is assumed to lose as many."""
     maximised: str = ""
     chosen: str = ""
     candidates: tuple[GainsAtDelay, ...] = ()
 
 
 class OwnMargins(Published):
-    """The delay margins of one vehicle's own loop delay, one for each gain set; None without a limit."""
+    """The margins that apply to one vehicle's loop delay, one for each gain set; None without a limit."""
 
     system_id: int
     delay_margins_s: tuple[Margin, ...]
@@ -359,7 +359,7 @@ class Design(Published):
     ) -> Self:
         """The design with other margins of the gain schedule, and with other parts."""
         every = (
-            entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
-            for entry, own_s, late_s in zip(self.schedule, sampled_s, continuous_s, strict=True)
+            entry.model_copy(update={"delay_margin_s": plain(sampled), "delay_margin_continuous_s": plain(late)})
+            for entry, sampled, late in zip(self.schedule, sampled_s, continuous_s, strict=True)
         )
         return self.with_schedule(tuple(every), **parts)

@@ -1,10 +1,10 @@
 """The spread of spacing errors that a scenario's gusts, wind and navigation errors cause at a loop delay.
 
-It is exact for a station that closes every loop at one rate (`gains.performance.disturbed`), with the fastest gains and
-links of one constant delay. If clocks differ, the station interpolates the state of the vehicle in front between two
-reports, which averages white noise. By how much is known only after the flight. Before it, all vehicles are assumed to
-sample at the same time, and the errors reported in flight may be up to 13 % smaller. The spread is not computed for the
-loop on board, nor for a disturbance that depends on the errors (a sector).
+The spread is exact for a station that closes every loop at one rate (`gains.performance.disturbed`), with the fastest
+gains and links of one constant delay. If clocks differ, the station interpolates the state of the vehicle in front
+between two reports, which averages white noise. The amount is known only after the flight. Before it, all vehicles are
+assumed to sample at the same time, and the errors reported in flight may be up to 13 % smaller. The spread is not
+computed for the loop on board, nor for a disturbance that depends on the errors (a sector).
 """
 
 from dataclasses import replace
@@ -39,7 +39,7 @@ def with_spread(design: Design, plan: FlightPlan) -> Design:
 def predicted_spread(
     design: Design, scenario: Scenario, delay_s: float | FloatArray | None, older: FloatArray | None = None
 ) -> PredictedSpread | None:
-    """The rms of each follower's spacing error; None if nothing disturbs the formation, or if it is unknown.
+    """The rms of each follower's spacing error; None if nothing disturbs the formation, or if the rms is unknown.
 
     `delay_s` and `older` are those of `gains.performance.disturbed.DisturbedFormation`.
     """

@@ -2,10 +2,10 @@
 
 On links with only a constant delay it is a sum. With jitter the mean is not enough: no delay is negative, a datagram
 that must not overtake waits for the one before it, and a state that arrives after a newer one is not used. Datagrams
-are therefore drawn as the links would carry them, with their own seed, and the median is taken, which flights report
-as p50 of the slowest vehicle. If datagrams may overtake each other and jitter is as large as the delay, flights were up
-to 8 % faster than this. The median says nothing about datagrams that are lost or very late; `effective_loop_delays_s`
-takes them into account.
+are therefore drawn as the links would carry them, with a fixed seed. Their median is what flights report as p50 of the
+slowest vehicle. If datagrams may overtake each other and jitter is as large as the delay, loop delays in flight were up
+to 8 % shorter. The median says nothing about datagrams that are lost or very late; `effective_loop_delays_s` takes them
+into account.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -56,7 +56,7 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
 
 
 def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
-    """The expected loop delays (s) of a plan's vehicles; on board, they count from the states that commands need."""
+    """The expected loop delays (s) of a plan's vehicles; on board, from the oldest state that each command needs."""
     return expected_loop_delays_s(plan.scenario, _heard(plan))
 
 
@@ -84,7 +84,7 @@ def expected_loop_delays_s(
     On links with only a constant delay, it is the delay up and down plus half the shorter period of telemetry and
     control: the first command computed from a state waits between zero and a whole period, depending on the phases of
     vehicle and station. With jitter or losses it is the median over drawn datagrams, averaged over the phases. If
-    `heard` names other vehicles for a vehicle, it counts from the oldest of their states instead of its own. The time
+    `heard` names other vehicles for a vehicle, its delay counts from the oldest of their states, not its own. The time
     that datagrams wait for a channel is not included (`waits_for_channels`, `gcs.preflight.channels`).
     """
     paths = _paths(scenario, heard)
@@ -258,7 +258,7 @@ def _longest_repetition(scenario: Scenario) -> int:
 
 
 def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -> FloatArray:
-    """Ages of the newest state at random ticks, minus the time it was used again; of several vehicles, the oldest."""
+    """Ages of the newest state at random ticks, less the time since its first use; of several vehicles, the oldest."""
     every, rates = [_heard_over(scenario, up, rng) for up in ups], scenario.rates
     shape, period_s = (_PHASES, _MOST // 2 // _PHASES), 1.0 / rates.control_hz
     constant_s = np.full(shape, max(up.delay_max_s for up in ups))
@@ -280,7 +280,7 @@ def _ages_s(scenario: Scenario, ups: Sequence[Link], rng: np.random.Generator) -
 
 
 def _oldest_s(scenario: Scenario, every: Sequence[_Heard], rng: np.random.Generator) -> FloatArray:
-    """Ages (s) of the oldest of the newest states of several vehicles, minus the time it was used again.
+    """Ages (s) of the oldest of the newest states of several vehicles, less the time since its first use.
 
     Which vehicle's state is the oldest changes within a period of slower telemetry, and depends on the phases of the
     vehicles, which are drawn `_DRAWS` times. Empty if next to nothing arrives.

@@ -34,7 +34,7 @@ class Responses:
         """The responses of these vehicles.
 
         A vehicle that was left out of the flight has none. The response of the last vehicle flown stands in for it,
-        which makes no margin smaller: on a tree, all followers have the same gains.
+        which reduces no margin: on a tree, all followers have the same gains.
         """
         flown = [system_id for system_id in system_ids if system_id in self.of]
         return tuple(self.of[system_id if system_id in self.of else flown[-1]] for system_id in system_ids)
@@ -173,7 +173,7 @@ def given_responses(scenario: Scenario) -> Responses | None:
 
 
 def at_once(steps: Generator[None, None, Found]) -> Found:
-    """Run to its end a computation that a flight spreads over steps between control ticks, and return its result."""
+    """Run at once all steps of a computation that a flight spreads over control ticks, and return its result."""
     while True:
         try:
             next(steps)
@@ -184,8 +184,8 @@ def at_once(steps: Generator[None, None, Found]) -> Found:
 def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None, list[float]]:
     """The margin (s) of each of the plan's gains, computed in steps.
 
-    If every vehicle closes its own loop and both axes are alike, a step is one vehicle, some milliseconds
-    (`gains.performance.lone_margin`). Otherwise a step is `sampled_margin` of all vehicles together.
+    If every vehicle closes its own loop and both axes are alike, a step is the margin of one vehicle, some
+    milliseconds (`gains.performance.lone_margin`). Otherwise a step is `sampled_margin` of all vehicles together.
     """
     of, margins_s = responses.in_order(plan.formation.system_ids), list[float]()
     for K in plan.gains:
@@ -202,7 +202,7 @@ def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None
 
 
 def own_gains(plan: FlightPlan, K: FloatArray) -> list[tuple[float, float]] | None:
-    """k1 and k3 of each vehicle's own loop; None unless every loop has this form."""
+    """k1 and k3 of each vehicle's own loop; None unless loops are separate, at one rate and alike on both axes."""
     model, found = plan.model, list[tuple[float, float]]()
     if not plan.separable or plan.timing.commands > 1:
         return None

@@ -1,4 +1,4 @@
-"""The scenario's formation: who follows whom, and at which distance."""
+"""The scenario's formation: who follows whom, and at which offset."""
 
 from dataclasses import dataclass
 

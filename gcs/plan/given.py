@@ -26,12 +26,13 @@ def with_given(
 
 
 def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off") -> Scenario:
-    """The scenario with a given K of u = +K e, the same for north and east; other requirements are dropped.
+    """The scenario with a given K of u = +K e, the same for north and east; requirements as in `with_given`.
 
     K has a row for each vehicle and a column for each error of one axis, in the order of
     `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
-    velocity error. `gains.design` finds such a K; so does any LQR for A and B of this model, whose u = -K e has the
-    opposite sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
+    velocity error. `gains.design` finds such a K; so does any LQR for A and B of this model, with the opposite sign:
+    its law is u = -K e. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite
+    numbers.
     """
     formation = plan_formation(scenario)
     model, gain = formation.model, real_matrix("K", K)

@@ -1,8 +1,8 @@
 """The loops of a formation, each stable or not by itself, and how close their expected loop delays are to instability.
 
 In a leader-follower tree every vehicle closes its own loop, and only its own link matters. Vehicles that also hear
-those behind them share a loop. Its margin assumes one loop delay for all. If links differ, that says little: the loop
-may break far below it or stand far above it. Its growth at the loop delays of all its vehicles then decides.
+those behind them share a loop. Its margin assumes one loop delay for all. If links differ, the margin says little: the
+loop may break far below it or stay stable far above it. Its growth at the loop delays of all its vehicles decides.
 """
 
 from collections.abc import Callable, Hashable, Mapping
@@ -17,15 +17,15 @@ from gcs.plan.mismatch import Window
 from scenarios.keys.own import BUILT_IN
 
 _STEP, _STEPS = 0.1, 100
-"""Size, in margins of the loop, and number of the steps that search for a shared loop's edge of stability."""
+"""Size, as a share of the margin, and number of the steps that search for a shared loop's edge of stability."""
 _HALVINGS = 8
 _MOST_BY_GROWTH, _MOST_SHARING = 6, 20
-"""Most vehicles of a shared loop whose edge of stability is found by growth rates, which takes seconds, and at all."""
+"""Most vehicles in a shared loop whose edge of stability is found: by growth rates, which takes seconds, and at all."""
 
 
 def is_modelled(plan: FlightPlan) -> bool:
-    """Whether the models of `plan_loops` describe the flights. They do not for a nonlinear law or the user's own
-    dynamics, for which they tell only which vehicles are coupled."""
+    """Whether the models of `plan_loops` describe the flights. They do not for a law without a stated K or the
+    user's own dynamics, for which they tell only which vehicles are coupled."""
     return not isnan(plan.delay_margin_s) and plan.scenario.dynamics in BUILT_IN
 
 
@@ -74,11 +74,12 @@ def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
 
 
 def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Window:
-    """Range of one vehicle's loop delays in which its loop is predicted to be stable; NaN if no model predicts it.
+    """Range of one vehicle's loop delays in which its loop is predicted to be stable.
 
     The links of all other vehicles stay as they are in the scenario. If a shared loop is unstable over the scenario's
     links, shorter delays of this vehicle are searched; the result is (0, 0) if none makes it stable. The growth changes
-    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead.
+    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead. If
+    the flights are not modelled (`is_modelled`), the range ends at the plan's margin, NaN if that is unknown.
     """
     block = loop_of(plan, system_id)
     if not is_modelled(plan):
@@ -141,8 +142,8 @@ def links_differ(plan: FlightPlan, block: CoupledBlock) -> bool:
 def link_delays_left_s(plan: FlightPlan, now_s: Mapping[int, float]) -> dict[int, float]:
     """How much more delay (s) each vehicle's link can take, all others as in the scenario; NaN where unknown.
 
-    `now_s` are the effective loop delays. It is unknown in a shared loop on board, where an up link also delays the
-    commands of others.
+    `now_s` are the effective loop delays. The result is unknown for a large shared loop, and for one on board, where an
+    up link also delays the commands of others.
     """
     windows, left_s = dict[Hashable, Window](), dict[int, float]()
     for block in plan_loops(plan):
@@ -159,7 +160,8 @@ def link_delays_left_s(plan: FlightPlan, now_s: Mapping[int, float]) -> dict[int
 def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
     """The margin (s) of each of the plan's gains over the scenario's links; None if the margins for equal delays apply.
 
-    They apply unless vehicles share a loop over different links. The margin is then that of the slowest vehicle.
+    They apply unless vehicles share a loop over different links. All delays of such a loop are scaled together
+    until it breaks; its margin is then the delay of its slowest vehicle.
     """
     if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
         return None
@@ -196,7 +198,7 @@ def _over_links(plan: FlightPlan) -> tuple[float | None, dict[int, float]]:
 
     The formation's is that of its least stable loop, at its slowest vehicle; None if no loop is shared over different
     links, and the margin for equal delays applies. Single vehicles have one of their own only if all feedback is late:
-    a slow link then uses up the margin of its own loop, not the least of all loops.
+    a slow link then uses up the margin of its own loop, not the smallest of all loops.
     """
     delays_s, least_s, any_differs = planned_loop_delays_s(plan), inf, False
     own_s, known_s = dict[int, float](), dict[Hashable, float]()
@@ -232,7 +234,7 @@ def _shared_margins_s(plan: FlightPlan, block: CoupledBlock, margin_s: float) ->
 
 
 def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """Infinite margins, by row, for the vehicles without any delayed feedback; empty if no vehicle has any."""
+    """Infinite margins, by row, for the vehicles without any delayed feedback; empty if none has delayed feedback."""
     row, blocks = plan.formation.row, plan_loops(plan)
     late = [block for block in blocks if block.has_late_terms]
     at_once = [own for block in blocks if not block.has_late_terms for own in block.system_ids]
@@ -240,7 +242,7 @@ def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
 
 
 def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
-    """The factor on its expected loop delays at which a shared loop breaks; 0 if it is unstable at any delays."""
+    """The factor on its expected loop delays at which a shared loop breaks; 0 if no shorter delays make it stable."""
     expected_s = planned_loop_delays_s(plan)
     own_s = {own: expected_s[own] for own in block.system_ids}
     if block.margin_s() == inf:

@@ -61,9 +61,9 @@ class Tolerated(NamedTuple):
 def tabulated(windows: Sequence[Sequence[Window]]) -> Callable[[float], Tolerated]:
     """The tolerance at any assumed delay, interpolated between tabulated windows; the delay is rounded to 1 ms.
 
-    `windows` holds, for each gain set, the window at each assumed delay in `TABULATED_S`. Interpolation is of the
-    reciprocals of the distances, because they are nearly linear: about k1 + k3 tau^. If only one of two neighbouring
-    windows has a lower end, its distance is used.
+    `windows` holds, for each gain set, the window at each assumed delay in `TABULATED_S`. Interpolates the
+    reciprocals of the distances, which are nearly linear: about k1 + k3 tau^. If only one of two neighbouring windows
+    has a lower end, its distance is used.
     """
     with np.errstate(divide="ignore"):
         reciprocal = 1.0 / np.array(
@@ -121,11 +121,11 @@ class Predicted(NamedTuple):
 
 @lru_cache(maxsize=1024)
 def window(flown: Predicted, assumed_s: float) -> Window:
-    """The mismatch window of a sampled formation that is predicted over `assumed_s`.
+    """The mismatch window of a sampled formation whose station predicts over `assumed_s`.
 
     The map of one period has a state for each command in transit. If these are too many, the window is that of the
-    continuous model, narrowed at either end by a common period of both rates, which exceeds the difference of the
-    models. Cached: all flights of a campaign use the same windows.
+    continuous model, narrowed at either end by a common period of both rates, which exceeds the difference between
+    the models. Cached: all flights of a campaign use the same windows.
     """
     if assumed_s > _MOST_ON_THE_WAY * flown.timing.faster_s:
         least_s, most_s = continuous_window(flown, assumed_s)
@@ -158,5 +158,5 @@ def assumption(scenario: Scenario) -> str:
         return ""
     if scenario.target_hz > 0.0:
         return f"where vehicles do not report their active targets, {as_sent}"
-    why = "rates.target_hz is 0" if scenario.rates.target_hz == 0.0 else "those of own loops do not show it"
-    return f"{as_sent}: no active targets are asked for, as {why}"
+    why = "rates.target_hz is 0" if scenario.rates.target_hz == 0.0 else "on board they do not show what acted"
+    return f"{as_sent}: active targets are not requested, as {why}"

@@ -21,7 +21,7 @@ from gcs.plan.formation import Formation
 
 AXES = "NE"
 _STILL_1_S = 1e-6
-"""Growth of own loops that counts as zero: they may keep an error, within rounding, but a prediction must not grow."""
+"""Growth rate of own loops that counts as zero. With prediction, their errors may persist but must not grow."""
 
 
 def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
@@ -29,7 +29,7 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
     Own gains are rounded to float32, in which they are uploaded: the analysed gains are those flown. Slower entries of
     the schedule keep the vehicles' own gains and reduce the share of the stream. Without any stream the formation is
-    stable at every delay. It flies without a stream while a vehicle is lost, if vehicles share loops.
+    stable at every delay. If vehicles share loops, it flies without a stream while a vehicle is lost.
     """
     timing = plan.onboard
     assert timing is not None

@@ -27,7 +27,7 @@ from scenarios.keys.own import BUILT_IN
 from scenarios.own_code import code_names, function_of
 from scenarios.schema import Scenario
 
-NOT_LINEAR = "law is not linear; measure it with gcs stress --onset"
+OWN_LAW = "law without control.linear; measure it with gcs stress --onset"
 OWN_DYNAMICS = "dynamics without [response], which gcs identify finds; or measure it with gcs stress --onset"
 TOLERANCE = 1e-6
 """Largest difference between a law and its matrices, relative to the largest entry of K."""
@@ -116,7 +116,7 @@ def accelerations(answer: object, vehicles: int) -> FloatArray:
 def own_plan(
     scenario: Scenario, given_plan: Callable[[Scenario], tuple[Design, FlightPlan]]
 ) -> tuple[Design, FlightPlan]:
-    """Design and plan of a scenario whose controller is code; `given_plan` makes those of gains given as blocks.
+    """Design and plan of a scenario whose controller is code; `given_plan` does this for given gain blocks.
 
     A law with a stated K (`control.linear`) has the margin of K, after a check that the two agree. Any other is flown
     with an unknown margin. The gain of its plan is the law linearised at zero error; only the search for the onset uses
@@ -134,7 +134,7 @@ def own_plan(
             method="python",
             period_s=plan.timing.held_s,
             vehicles=len(formation.system_ids),
-            margin_unknown=NOT_LINEAR,
+            margin_unknown=OWN_LAW,
             code=code_records(scenario),
         )
         return design, plan
@@ -171,7 +171,7 @@ def why_unknown(plan: FlightPlan) -> str:
     """Why the margin of a plan is unknown; empty if it is known."""
     if not isnan(plan.delay_margin_s):
         return ""
-    return NOT_LINEAR if plan.scenario.dynamics in BUILT_IN else OWN_DYNAMICS
+    return OWN_LAW if plan.scenario.dynamics in BUILT_IN else OWN_DYNAMICS
 
 
 def code_records(scenario: Scenario) -> tuple[CodeRecord, ...]:
@@ -180,7 +180,7 @@ def code_records(scenario: Scenario) -> tuple[CodeRecord, ...]:
 
 
 def code_by_key(scenario: Scenario) -> dict[str, CodeRecord]:
-    """The code file that each key names, by the key as it stands: "control.controller = my_law.py:law"."""
+    """The code file that each key names, by the key and its value: "control.controller = my_law.py:law"."""
     known = {code.name: code.sha256 for code in scenario.code}
     named = {f"{key} = {name}": name.rpartition(":")[0] for key, name in code_names(scenario).items()}
     return {text: CodeRecord(file=path, sha256=known[path]) for text, path in named.items()}

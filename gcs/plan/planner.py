@@ -62,15 +62,16 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Smallest and largest delay margin (s) of the gains flown around a lost vehicle."""
 _REQUIRED = "delay_margin_s", "alpha", "decay_rate_1_s", "string_peak_max", "loop"
 _SHOWN_S = (0.1, 0.3, 0.6, 1.0, 1.5, 3.0)
-"""Assumed delays (s) whose windows a design shows, if they tolerate a mismatch of one control period."""
+"""Assumed delays (s) at which a design shows its mismatch window, if the delay may exceed them by a period."""
 _MORE = 1.1
-"""A design whose margin falls short at the scenario's rates is repeated with this times the shortfall added."""
+"""If the margin at the scenario's rates falls short, a second design requires this multiple of the shortfall more."""
 
 
 def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Design, FlightPlan]:
-    """The design of a scenario, which records its measured links if `link` is given, and the plan to fly it.
+    """The design of a scenario and the plan to fly it. The design records `link`, the measured links, if given.
 
-    Raises gains.core.errors.GainsError if the requirement cannot be met, gcs.errors.InputError if links are unmeasured.
+    Raises gains.core.errors.GainsError if the requirement cannot be met, and gcs.errors.InputError if links have still
+    to be measured, or if the user's law or an unstable own loop is refused.
     """
     if scenario.control.for_link == "measured":
         raise InputError(f"{scenario.name}: control.for_link: {MEASURED_WANTED}")
@@ -90,7 +91,7 @@ def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Desig
 def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     """Design and plan of gains that are designed or given, by inclusion or on an information pattern.
 
-    With K1 / s, K2 / s and K3 / s² the loop is s times slower and takes s times the delay.
+    With K1 / s, K2 / s and K3 / s² the loop is s times slower and tolerates s times the delay.
     """
     formation, period_s = plan_formation(scenario), loop_timing(scenario).held_s
     model, scales, control = formation.model, scenario.monitor.time_scales, scenario.control
@@ -168,7 +169,7 @@ def with_trade_off(design: Design) -> Design:
 
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of the loop as flown, from those of its ground loop, with the figures at its delay."""
+    """Design and plan of the loop as flown, with its figures at the loop delay, from those of the ground loop."""
     if plan.onboard is not None:
         design, plan = onboard_plan(design, plan)
         plan = replace(plan, own_margins_s=unlimited(plan))
@@ -180,10 +181,10 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
 
 def _prediction(plan: FlightPlan) -> PredictionPart:
-    """The mismatch windows of the fastest gains. Also computes the plan's tolerance, too slow for a control tick."""
+    """The mismatch windows of the fastest gains. Also computes the plan's tolerance, which takes too long in flight."""
     assumed_s = plan.assumed_s
     plan.tolerance(assumed_s or 0.0)
-    # gains for a short delay tolerate almost nothing over a long one, where the continuous model takes seconds
+    # at a long assumed delay, gains for a short one tolerate almost nothing and the continuous window takes seconds
     flown = plan.predicted(plan.gain)
     fits = [at_s for at_s in _SHOWN_S if window(flown, at_s)[1] > at_s + plan.timing.held_s]
     found = {
@@ -246,7 +247,7 @@ def described(design: Design, plan: FlightPlan) -> Design:
     every = plan.responses.in_order(plan.formation.system_ids)
     continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
     response = known.response
-    if (gains := design.inclusion_gains) is not None:  # equal for all vehicles, which only a leader-follower tree has
+    if (gains := design.inclusion_gains) is not None:  # inclusion gains, the same for all followers in a tree
         fed = design.feed_forward
         peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})

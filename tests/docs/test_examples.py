@@ -27,8 +27,8 @@ def test_an_own_law_flies_with_and_without_a_margin(tmp_path: Path) -> None:
     command = [sys.executable, EXAMPLES / "own_law" / "fly.py"]
     said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path).stdout.splitlines()
     assert said == [
-        "soft: stable, commands up to 14.7 m/s² an axis, delay margin unknown: law is not linear; measure it with gcs "
-        "stress --onset",
+        "soft: stable, commands up to 14.7 m/s² an axis, delay margin unknown: law without control.linear; measure it "
+        "with gcs stress --onset",
         "linear: stable, commands up to 18.7 m/s² an axis, delay margin 0.186 s",
     ]
 

@@ -6,7 +6,7 @@ import pytest
 from gcs import VirtualFlight, fly_virtual
 from gcs.control.own_law import BAD_IN_A_ROW, BUDGET_SHARE, FlownLaw
 from gcs.errors import InputError
-from gcs.plan.own_law import NOT_LINEAR, OWN_DYNAMICS, LawFormation, law_formation
+from gcs.plan.own_law import OWN_DYNAMICS, OWN_LAW, LawFormation, law_formation
 from gcs.plan.planner import flight_plan
 from gcs.station.journal import Journal
 from scenarios.keys.course import ChangedOffset, FormationChange
@@ -33,7 +33,7 @@ def test_the_law_of_the_gains_flies_as_the_gains_do(built_in: VirtualFlight) -> 
     assert apart_m(flight, built_in) <= ROUNDING_M
     assert np.nanmax(np.abs(flight.command_ne_m_s2 - built_in.command_ne_m_s2)) < 1e-9  # sums in another order
     assert np.array_equal(flight.loop_delay_s, built_in.loop_delay_s, equal_nan=True)
-    assert flight.design.margin_unknown == flight.summary.margin_unknown == NOT_LINEAR
+    assert flight.design.margin_unknown == flight.summary.margin_unknown == OWN_LAW
     assert flight.summary.delay_margin_s is flight.summary.headroom_min is None
     assert flight.summary.law is not None
     assert flight.summary.law.to_dict() == {"calls": 80, "unusable": 0, "over_budget": None, "budget_s": 0.01}

@@ -8,7 +8,7 @@ import pytest
 
 from gcs import fly_virtual
 from gcs.cli.main import main
-from gcs.plan.own_law import NOT_LINEAR
+from gcs.plan.own_law import OWN_LAW
 from gcs.runs.files import read_ticks
 from scenarios.files import dump
 from scenarios.own_code import write_code
@@ -80,7 +80,7 @@ def test_check_shows_the_code_that_it_runs(
     told = capsys.readouterr().out
     [code] = coded(MARKS, law="soft").code
     assert f"runs     control.controller = own.py:soft, sha256 {code.sha256}" in told
-    assert f"margin   unknown: {NOT_LINEAR}" in told
+    assert f"margin   unknown: {OWN_LAW}" in told
     assert code_of(monkeypatch, "check", "pair.toml", "--allow-code", "--json") == 0
     assert json.loads(capsys.readouterr().out)["code"] == {
         "control.controller = own.py:soft": {"file": "own.py", "sha256": code.sha256}
@@ -93,7 +93,7 @@ def test_margins_that_nobody_computed_cannot_be_asserted(
     assert code_of(monkeypatch, "stress", "pair.toml", "--assert-onset", "0.01", "--allow-code") == 2
     assert "the margin is unknown" in capsys.readouterr().err
     assert code_of(monkeypatch, "margin", "pair.toml", "--allow-code") == 2
-    assert NOT_LINEAR in capsys.readouterr().err
+    assert OWN_LAW in capsys.readouterr().err
 
 
 def test_a_campaign_says_how_to_fly_its_code_again(
