@@ -16,8 +16,8 @@ from docs.generate.api import documented
 MODULES = sorted(module.name for module in walk_packages(gains.__path__, "gains."))
 PUBLIC_MODULES = [name for name in MODULES if "._" not in name]
 
-# Functions of public modules that other modules of `gains` or gcs alone call, and that tests judge by known answers. A
-# new function is not among them and so needs an example.
+# Functions of public modules that only other modules of `gains` or gcs call. Instead of examples they have tests with
+# known answers. A function that is not listed here needs an example.
 INTERNAL_FUNCTIONS = {
     "gains.core.arrays.matrix_exponentials",
     "gains.core.arrays.spectral_norms",
@@ -97,7 +97,7 @@ def called_functions() -> dict[str, Any]:
 
 
 def classes_taken(functions: dict[str, Any]) -> dict[str, Any]:
-    """The classes of `gains` whose objects some of the functions want as an argument."""
+    """The classes of `gains` that the functions take as arguments."""
     parameters = (p for function in functions.values() for p in inspect.signature(function).parameters.values())
     named = set(re.findall(r"gains(?:\.\w+)+", " ".join(str(parameter.annotation) for parameter in parameters)))
     classes = {full: value for name in PUBLIC_MODULES for full, value in public(name, inspect.isclass).items()}
@@ -126,7 +126,7 @@ def test_reference_page_examples_run_in_an_empty_session(name: str) -> None:
     assert {test.name.removeprefix(f"{name}.") for test in found if test.examples} <= texts.keys()
 
 
-def test_functions_called_and_the_classes_they_take_have_examples() -> None:
+def test_called_functions_and_their_argument_classes_have_examples() -> None:
     functions = called_functions()
     classes = classes_taken(functions)
     called = {"gains.delay.constant.analyse_delay", "gains.design.design.design"}
@@ -136,12 +136,12 @@ def test_functions_called_and_the_classes_they_take_have_examples() -> None:
     everything = functions | classes
     examples = {full: doctest.DocTestParser().get_examples(inspect.getdoc(v) or "") for full, v in everything.items()}
     assert [full for full in functions if not examples[full]] == []
-    # a class is made in an example, or what a function with an example returns
+    # an example makes each class, or a function with an example returns it
     made = "".join(example.source + example.want for own in examples.values() for example in own)
     made += " ".join(f"{inspect.signature(function).return_annotation}(" for function in functions.values())
     assert [full for full in classes if f"{full.split('.')[-1]}(" not in made and full not in made] == []
 
 
-def test_what_is_called_internal_is_there() -> None:
+def test_listed_internal_functions_exist() -> None:
     functions = {full for name in PUBLIC_MODULES for full in public(name, inspect.isfunction)}
     assert functions >= INTERNAL_FUNCTIONS

@@ -43,10 +43,10 @@ ROOT = blocks.ROOT
 PAGES = {str(page.relative_to(ROOT)): page for page in blocks.pages()}
 SESSIONS = [name for name, page in PAGES.items() if any(_ for _ in steps_of(page))]
 FLOWN_S = 15.0
-"""Scenarios are flown no longer than this in real time; their commands are typed as they stand."""
+"""The pages' scenarios are shortened to this, so that their commands can be typed as they stand."""
 
 
-def test_the_reference_and_the_schema_follow_from_the_code() -> None:
+def test_the_reference_and_the_schema_match_the_code() -> None:
     assert reference.stale() == [], "python3 make.py reference"
 
 
@@ -74,7 +74,7 @@ def test_the_readme_is_short() -> None:
     assert len(PAGES["README.md"].read_text(encoding="utf-8").splitlines()) <= 120
 
 
-def test_a_test_has_a_name_of_at_most_ten_words() -> None:
+def test_names_of_tests_have_at_most_ten_words() -> None:
     names = [
         name for file in (ROOT / "tests").rglob("*.py") for name in re.findall(r"def test_(\w+)", file.read_text())
     ]
@@ -166,7 +166,7 @@ def test_every_field_of_a_trial_is_described_and_no_other() -> None:
 
 
 def shell(steps: list[Step], folder: Path) -> None:
-    """Type the steps of a session, and expect of each command the exit code that its page says."""
+    """Run the steps of a session; each command must end with the exit code that its page states."""
     session: dict[str, Any] = {}
     servers: list[subprocess.Popen[bytes]] = []
     try:
@@ -188,7 +188,7 @@ def shell(steps: list[Step], folder: Path) -> None:
 
 
 def server(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
-    """A program that runs on, once it has said its first line."""
+    """Start a program that keeps running, and wait for its first line of output."""
     program = Path(sys.executable).with_name(command[0])
     started = subprocess.Popen([program, *command[1:]], cwd=folder, stdout=subprocess.PIPE)
     assert started.stdout is not None
@@ -205,7 +205,7 @@ def python(text: str, session: dict[str, Any]) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A place like the repository, whose scenarios are flown for a short time."""
+    """A folder laid out like the repository, with scenarios shortened to `FLOWN_S`."""
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios", ignore=shutil.ignore_patterns("*.py*", "__pycache__"))
@@ -216,7 +216,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-# the README's command in virtual time is that of a figure, which is compared above
+# the README's command in virtual time belongs to a figure, which is compared above
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name != "README.md"])
 def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
@@ -232,16 +232,16 @@ def test_what_a_page_says_to_type_works_in_real_time(name: str, folder: Path) ->
         try:
             shell(steps, folder)
             return
-        except CommandError as error:  # the pages use the usual port, which another test may have for a moment
+        except CommandError as error:  # the pages use the default port, which another test may hold for a moment
             if "Address already in use" not in str(error) or not tries_left:
                 raise
             wait_until_free(14550)
-            for made in (folder / "runs", *folder.glob("*.key")):  # never overwritten
+            for made in (folder / "runs", *folder.glob("*.key")):  # commands refuse to overwrite these
                 shutil.rmtree(made) if made.is_dir() else made.unlink(missing_ok=True)
 
 
 def wait_until_free(port: int) -> None:
-    """Wait until nobody on this machine listens at a UDP port."""
+    """Wait until no process on this machine listens on a UDP port."""
     for _ in range(600):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", port))

@@ -13,7 +13,7 @@ from tests.support.paths import ROOT, SCENARIOS
 
 [SCRIPT] = [step.text for step in steps_of(ROOT / "docs/how-to/sitl-in-ci.md") if step.file == "with-sitl.sh"]
 RECORDER = '#!/bin/bash\nprintf "%s\\n" "$@" > arguments.part\nmv arguments.part arguments\nexec sleep 60\n'
-"""Stands in for arducopter: notes its arguments in the folder where it is started."""
+"""Stands in for arducopter: writes its arguments to a file in the folder where it is started."""
 WAIT = 'for i in 1 2 3 4 5; do until [ -e sitl/$i/arguments ]; do sleep 0.02; done; done; exit "$0"'
 
 
@@ -33,10 +33,10 @@ def test_five_vehicles_start_at_the_places_of_copters5(tmp_path: Path) -> None:
     homes: dict[int, list[float]] = {}
     instances: set[str] = set()
     for number in range(1, 6):
-        told = (tmp_path / f"sitl/{number}/arguments").read_text().split("\n")
-        after = {name: told[told.index(name) + 1] for name in ("--sysid", "--home", "--serial0", "--defaults")}
+        given = (tmp_path / f"sitl/{number}/arguments").read_text().split("\n")
+        after = {name: given[given.index(name) + 1] for name in ("--sysid", "--home", "--serial0", "--defaults")}
         homes[int(after["--sysid"])] = [float(part) for part in after["--home"].split(",")]
-        instances |= {word for word in told if word.startswith("-I")}
+        instances |= {word for word in given if word.startswith("-I")}
         assert after["--serial0"] == "udpclient:127.0.0.1:14550"
         assert after["--defaults"] == os.path.realpath(tmp_path / "ardupilot/Tools/autotest/default_params/copter.parm")
     assert instances == {f"-I{k}" for k in range(5)}
@@ -45,9 +45,9 @@ def test_five_vehicles_start_at_the_places_of_copters5(tmp_path: Path) -> None:
         latitude, longitude, altitude_m, _ = homes[vehicle.system_id]
         metres = 6_371_000.0 * radians(1.0)
         place = (latitude - origin[0]) * metres, (longitude - origin[1]) * metres * cos(radians(origin[0]))
-        assert place == pytest.approx(vehicle.position_ne_m, abs=0.05)  # 1 in 900 between spheres, 1 cm of digits
+        assert place == pytest.approx(vehicle.position_ne_m, abs=0.05)  # earth radii differ by 1 in 900, digits by 1 cm
         assert altitude_m == origin[2]
 
 
-def test_the_script_exits_with_the_gates_code_and_ends_vehicles(tmp_path: Path) -> None:
+def test_the_script_exits_with_the_gates_code_and_stops_vehicles(tmp_path: Path) -> None:
     assert started(tmp_path, 3).returncode == 3  # and returned at once, though the vehicles would sleep for a minute
