@@ -18,7 +18,7 @@ OFFBOARD = 6 << 16
 AUTOPILOTS = {ARDUCOPTER: 3, PX4_COPTER: 12}
 
 
-class Told:
+class Informed:
     """Start-up after a vehicle has sent all messages except the one with id `but`, and accepted their rates."""
 
     def __init__(self, kind: Kind, *, flags: int = GOOD, but: int = -1) -> None:
@@ -47,7 +47,7 @@ class Told:
 
 
 def test_arducopter_goes_guided_arms_takes_off_and_then_is_ready() -> None:
-    copter = Told(ARDUCOPTER)
+    copter = Informed(ARDUCOPTER)
     assert copter.advised() == ("does not enter GUIDED", (176, (1.0, 4.0)))
     assert copter.advised(4) == ("does not arm", (400, (1.0,)))
     assert copter.advised(4, armed=True) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
@@ -58,8 +58,8 @@ def test_arducopter_goes_guided_arms_takes_off_and_then_is_ready() -> None:
     assert copter.advised(4, armed=True) == ("", None)
 
 
-def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
-    copter, hold = Told(PX4_COPTER), 4 << 16 | 3 << 24
+def test_px4_arms_takes_off_to_altitude_amsl_then_enters_offboard() -> None:
+    copter, hold = Informed(PX4_COPTER), 4 << 16 | 3 << 24
     assert copter.advised(hold) == ("does not arm", (400, (1.0,)))
     _, command = copter.advised(hold, armed=True)
     assert command is not None
@@ -77,7 +77,7 @@ def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
 )
 def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready: bool) -> None:
     for kind in (ARDUCOPTER, PX4_COPTER):
-        missing, command = Told(kind, flags=flags).advised()
+        missing, command = Informed(kind, flags=flags).advised()
         assert (command is not None) == ready
         assert ready or missing == f"has no position yet (estimator flags 0x{flags:x})"
 
@@ -91,11 +91,11 @@ def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready:
     ],
 )
 def test_a_message_that_is_missing_is_named(unsaid: int, words: str) -> None:
-    assert Told(ARDUCOPTER, but=unsaid).advised() == (words, None)
+    assert Informed(ARDUCOPTER, but=unsaid).advised() == (words, None)
 
 
 def test_unaccepted_rate_unknown_clock_and_unknown_origin_are_named() -> None:
-    copter = Told(ARDUCOPTER)
+    copter = Informed(ARDUCOPTER)
     assert copter.advised(clock_known=False) == ("does not answer TIMESYNC", None)
     copter.startup.origin = None
     assert copter.advised() == ("does not say where its local origin is", None)
@@ -130,11 +130,11 @@ def test_a_vehicle_on_the_ground_after_flight_has_landed(base_mode: int, status:
     assert bool(startup.stays_disarmed) == lands
 
 
-def test_a_landed_vehicle_that_its_pilot_flies_again_is_flown() -> None:
+def test_a_landed_vehicle_whose_pilot_takes_off_again_is_flown() -> None:
     startup = startup_that_flew()
     startup.take(0, (4, 2, 3, 0, 3, 3))
     startup.take(0, (5, 2, 3, 0x80, 4, 3))
-    assert not startup.stays_disarmed  # the altitude is from before
+    assert not startup.stays_disarmed  # the newest altitude is from before the landing
     startup.take(0, (5, 2, 3, 0, 3, 3))
     startup.take(33, (2000, -353632620, 1491652370, 584_100, 100, 0, 0, 0, 0))
     startup.take(0, (5, 2, 3, 0x80, 4, 3))
@@ -163,7 +163,7 @@ def test_repeated_refusals_to_arm_are_one_text_and_a_count() -> None:
     assert startup.arming_refusals == 3
     startup.take(0, (4, 2, 3, 0x80, 4, 3))
     assert startup.arming_refusals == 0
-    assert [startup.is_news("Land complete") for _ in range(2)] == [True, True]  # in the air everything is said
+    assert [startup.is_news("Land complete") for _ in range(2)] == [True, True]  # in the air every text is passed on
 
 
 def test_a_takeoff_counts_though_unanswered_and_refused_on_repetition() -> None:
@@ -228,12 +228,12 @@ def test_a_position_of_zeros_is_none() -> None:
     assert startup.relative_altitude_m is None
 
 
-def test_the_local_height_carries_an_altitude_on_that_is_old() -> None:
+def test_an_old_altitude_is_updated_from_the_local_height() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(32, (10_000, 0.0, 0.0, -18.6, 0.0, 0.0, 0.0))
     startup.take(33, (10_000, 470000000, 80000000, 400_000, 19_600, 0, 0, 0, 0))
     startup.take(32, (10_900, 0.0, 0.0, -19.1, 0.0, 0.0, 0.0))
-    assert startup.relative_altitude_m == 19.6  # reported five times a second: another may follow
+    assert startup.relative_altitude_m == 19.6  # reported five times a second: the next may still arrive
     startup.take(32, (11_100, 0.0, 0.0, -19.3, 0.0, 0.0, 0.0))
     assert startup.relative_altitude_m == pytest.approx(20.3)
 
@@ -241,7 +241,7 @@ def test_the_local_height_carries_an_altitude_on_that_is_old() -> None:
 def test_a_restarted_vehicle_has_to_report_its_origin_again() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(49, (471000000, 81000000, 400_000, 0))
-    for base_mode, known in ((128, True), (0, False)):  # an armed vehicle's clock has only jumped
+    for base_mode, known in ((128, True), (0, False)):  # if it is armed, only its clock has jumped
         startup.take(0, (2, 3, 0, 128, 4, 3))
         startup.begin_anew()
         startup.take(0, (2, 3, 0, base_mode, 4, 3))

@@ -1,4 +1,4 @@
-"""Whose a vehicle is: what its heartbeats show of a pilot's hand, and what the station then commands."""
+"""Who flies a vehicle: what its heartbeats show of a pilot's intervention, and what the station then commands."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ STABILIZE, GUIDED, LOITER, RTL, POSCTL = 0, 4, 5, 6, 3 << 16
 
 
 class Talk:
-    """A vehicle with an autopilot at a station, which knows all that it needs but its heartbeats."""
+    """A vehicle with an autopilot, of which the station knows all that it needs except heartbeats."""
 
     def __init__(self, autopilot: int = ARDUPILOT) -> None:
         self.texts: list[str] = []
@@ -40,14 +40,14 @@ class Talk:
         self.hear(mavlink.GLOBAL_POSITION_INT, (1000, -353632620, 1491652370, 584_000 + mm, mm, 0, 0, 0, 0))
 
     def heartbeat(self, mode: int, *, armed: bool, status: int = STANDBY, after_s: float = 3.0) -> None:
-        """A heartbeat, so late that it was made after all that was commanded."""
+        """A heartbeat, by default so late that it was sent after all earlier commands had arrived."""
         self.now_ns += round(after_s * NS_PER_S)
         fields = mode, 2, self._autopilot, 0x80 if armed else 0, status, 3
         self.vehicle.heartbeat(fields, self.now_ns)
         self.hear(mavlink.HEARTBEAT, fields)
 
-    def told(self, *, answers: bool = True, seconds: float = 4.0) -> list[int]:
-        """The commands sent meanwhile but for rates, which are accepted as the others are if it `answers`."""
+    def commanded(self, *, answers: bool = True, seconds: float = 4.0) -> list[int]:
+        """Commands sent within `seconds`, except for rates; these are always accepted, the others if it `answers`."""
         numbers: list[int] = []
         for _ in range(round(seconds * 50.0)):
             self.now_ns += NS_PER_S // 50
@@ -66,13 +66,13 @@ class Talk:
 def test_a_vehicle_that_somebody_disarms_is_not_armed_again() -> None:
     talk = Talk()
     talk.heartbeat(STABILIZE, armed=False)
-    assert talk.told() == [SET_MODE, ARM_DISARM, TAKE_OFF]
+    assert talk.commanded() == [SET_MODE, ARM_DISARM, TAKE_OFF]
     talk.heartbeat(GUIDED, armed=False)  # before any heartbeat showed it armed
-    assert talk.told() == []
+    assert talk.commanded() == []
     assert talk.texts == ["was disarmed"]
     assert talk.vehicle.missing == "was disarmed and is not armed again"
     talk.heartbeat(GUIDED, armed=True)  # by its pilot
-    assert talk.told() == [TAKE_OFF]
+    assert talk.commanded() == [TAKE_OFF]
 
 
 @pytest.mark.parametrize(
@@ -92,32 +92,32 @@ def test_a_failsafe_takes_no_vehicle_from_its_pilot(autopilot: int, modes: tuple
     for mode in modes:
         guided = mode == talk.vehicle.kind.guided_mode
         talk.heartbeat(mode, armed=True, status=ACTIVE if guided else CRITICAL)
-    assert talk.told() == []
+    assert talk.commanded() == []
     assert talk.vehicle.taken_over
 
 
-def test_who_arms_a_vehicle_in_its_former_mode_flies_it() -> None:
+def test_whoever_arms_a_vehicle_in_its_former_mode_flies_it() -> None:
     talk = Talk()
     talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x481)  # no position yet
     talk.heartbeat(STABILIZE, armed=False)
-    assert talk.told() == []
+    assert talk.commanded() == []
     talk.heartbeat(STABILIZE, armed=True, status=ACTIVE)
     talk.hear(mavlink.EKF_STATUS_REPORT, flags=0x33F)
     talk.rise(7.5)
-    assert talk.told() == []
+    assert talk.commanded() == []
     assert talk.vehicle.missing == "is armed and not in GUIDED: flown by its pilot or its autopilot"
     talk.vehicle.end()
-    assert talk.told() == []
+    assert talk.commanded() == []
 
 
 @pytest.mark.parametrize("mode", [GUIDED, PX4_COPTER.hold_mode])
 def test_arming_under_way_at_the_end_is_followed_by_hold(mode: int) -> None:
     talk = Talk(ARDUPILOT if mode == GUIDED else PX4)
     talk.heartbeat(mode, armed=False)
-    assert talk.told(answers=False, seconds=0.5) == [ARM_DISARM]
+    assert talk.commanded(answers=False, seconds=0.5) == [ARM_DISARM]
     talk.vehicle.end()
     assert not talk.vehicle.ended
-    assert talk.told(answers=False, seconds=0.5) == [SET_MODE]
+    assert talk.commanded(answers=False, seconds=0.5) == [SET_MODE]
     assert talk.vehicle.missing == "does not hold"
-    assert talk.told(seconds=1.5) == [SET_MODE]  # not the arming again
+    assert talk.commanded(seconds=1.5) == [SET_MODE]  # not the arming again
     assert talk.vehicle.ended

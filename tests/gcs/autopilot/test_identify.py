@@ -78,7 +78,7 @@ def test_noise_of_a_centimetre_a_second_chooses_no_richer_model(response: Respon
     seen = found(noisy)
     assert seen is not None
     assert (seen.response.model == "lag") == (response.model == "lag")
-    # what commands at the crossover are late by is found better than how it divides into lag and dead time
+    # the total delay of commands at the crossover is found better than its split into lag and dead time
     late_s, known_s = (r.lag_s + r.dead_time_s for r in (seen.response, response))
     assert late_s == pytest.approx(known_s, rel=0.05)
     assert seen.misfit == pytest.approx(0.01 / noisy.velocity_m_s.std(), rel=0.1)  # the noise, and nothing else
@@ -99,7 +99,7 @@ def test_losses_leave_the_same_response() -> None:
     assert seen.response.dead_time_s == pytest.approx(0.048, abs=1e-3)
 
 
-def test_jerk_limit_of_5_bends_a_square_but_not_this() -> None:
+def test_jerk_limit_of_5_bends_squares_but_not_the_manoeuvre() -> None:
     free, limited = found(flown(MODELS[2], 50.0)), found(flown(MODELS[2], 50.0, jerk_max_m_s3=5.0))
     assert free is not None
     assert limited is not None
@@ -109,7 +109,7 @@ def test_jerk_limit_of_5_bends_a_square_but_not_this() -> None:
     assert square.misfit > 10.0 * limited.misfit
 
 
-def test_one_that_does_not_follow_is_no_response() -> None:
+def test_a_vehicle_that_does_not_follow_shows_a_large_misfit() -> None:
     seen = found(flown(Response(0.15, 0.1), 50.0, acceleration_max_m_s2=0.2))
     assert seen is not None
     assert seen.misfit > MISFIT_MAX

@@ -1,4 +1,4 @@
-"""The limits that vehicles tell, and commands kept within them."""
+"""The limits that vehicles report, and commands kept within them."""
 
 from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER
 from gcs.autopilot.vehicle_limits import ReportedLimits
@@ -8,7 +8,7 @@ SECOND = 1_000_000_000
 
 
 def answered(kind: Kind, values: dict[bytes, float]) -> tuple[ReportedLimits, list[bytes]]:
-    """The limits after ten seconds of questions, of which a vehicle answers those it knows."""
+    """The limits after ten seconds of requests, and the names requested; a vehicle answers those in `values`."""
     limits, asked = ReportedLimits(), list[bytes]()
     for k in range(500):
         due = limits.next(kind, k * SECOND // 50, target_system=1, rtt_ns=0)
@@ -33,20 +33,20 @@ def test_a_px4s_limits_bound_what_it_is_sent() -> None:
     assert abs(limits.jerk_bound_m_s3 - 3.2) < 1e-9
 
 
-def test_a_vehicle_that_tells_nothing_is_asked_nine_times() -> None:
+def test_a_vehicle_without_valid_limits_is_asked_nine_times() -> None:
     limits, asked = answered(ARDUCOPTER, {b"WPNAV_ACCEL": float("nan"), b"PSC_JERK_XY": -1.0})
     assert len(asked) == 9
     assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3) == (2.0, 4.0)
     assert limits.in_words().endswith("it reports no limits")
 
 
-def test_what_no_vehicle_can_mean_is_no_limit() -> None:
-    told = {b"WPNAV_ACCEL": 3.5e-43, b"PSC_JERK_XY": 1e30}  # the bytes of an integer, read as a float; a broken frame
-    limits, _ = answered(ARDUCOPTER, told)
+def test_implausible_values_are_no_limits() -> None:
+    values = {b"WPNAV_ACCEL": 3.5e-43, b"PSC_JERK_XY": 1e30}  # an integer's bytes, read as a float; a broken frame
+    limits, _ = answered(ARDUCOPTER, values)
     assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3) == (2.0, 4.0)
 
 
-def test_what_was_not_asked_is_not_believed() -> None:
+def test_answers_to_nothing_asked_are_ignored() -> None:
     limits = ReportedLimits()
     limits.take((10.0, 3, 0, b"WPNAV_ACCEL\0", 9))
     assert limits.next(UNRECOGNISED, 0, target_system=1, rtt_ns=0) is None

@@ -28,7 +28,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "pair.toml"
 
 
-def code_of(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
+def exit_code(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
     monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
@@ -52,12 +52,12 @@ def code_of(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
 def test_a_command_that_was_not_allowed_runs_no_code(
     arguments: str, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(monkeypatch, *arguments.split()) == 2
-    told = capsys.readouterr()
-    assert (told.out, told.err.count("\n")) == ("", 1)
-    assert told.err.startswith("pair.toml: control.controller: read 'own.py:soft', wanted ")
+    assert exit_code(monkeypatch, *arguments.split()) == 2
+    printed = capsys.readouterr()
+    assert (printed.out, printed.err.count("\n")) == ("", 1)
+    assert printed.err.startswith("pair.toml: control.controller: read 'own.py:soft', wanted ")
     if arguments.split(maxsplit=1)[0] not in ("compare", "capacity"):
-        assert told.err.endswith("--allow-code to run the code in own.py\n")
+        assert printed.err.endswith("--allow-code to run the code in own.py\n")
     assert not Path("ran").exists()
 
 
@@ -76,33 +76,33 @@ def test_simulated_vehicles_run_no_code_that_was_not_allowed(
 def test_check_shows_the_code_that_it_runs(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(monkeypatch, "check", "pair.toml", "--allow-code") == 0
-    told = capsys.readouterr().out
+    assert exit_code(monkeypatch, "check", "pair.toml", "--allow-code") == 0
+    printed = capsys.readouterr().out
     [code] = coded(MARKS, law="soft").code
-    assert f"runs     control.controller = own.py:soft, sha256 {code.sha256}" in told
-    assert f"margin   unknown: {OWN_LAW}" in told
-    assert code_of(monkeypatch, "check", "pair.toml", "--allow-code", "--json") == 0
+    assert f"runs     control.controller = own.py:soft, sha256 {code.sha256}" in printed
+    assert f"margin   unknown: {OWN_LAW}" in printed
+    assert exit_code(monkeypatch, "check", "pair.toml", "--allow-code", "--json") == 0
     assert json.loads(capsys.readouterr().out)["code"] == {
         "control.controller = own.py:soft": {"file": "own.py", "sha256": code.sha256}
     }
 
 
-def test_margins_that_nobody_computed_cannot_be_asserted(
+def test_unknown_margins_cannot_be_asserted(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of(monkeypatch, "stress", "pair.toml", "--assert-onset", "0.01", "--allow-code") == 2
+    assert exit_code(monkeypatch, "stress", "pair.toml", "--assert-onset", "0.01", "--allow-code") == 2
     assert "the margin is unknown" in capsys.readouterr().err
-    assert code_of(monkeypatch, "margin", "pair.toml", "--allow-code") == 2
+    assert exit_code(monkeypatch, "margin", "pair.toml", "--allow-code") == 2
     assert OWN_LAW in capsys.readouterr().err
 
 
-def test_a_campaign_says_how_to_fly_its_code_again(
+def test_a_campaign_prints_the_command_that_reflies_its_code(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = "stress pair.toml --delay 0.1 --workers 1 --allow-code --out map"
-    assert code_of(monkeypatch, *arguments.split()) == 0
+    assert exit_code(monkeypatch, *arguments.split()) == 0
     [again] = [line for line in capsys.readouterr().out.splitlines() if line.startswith("again ")]
-    assert code_of(monkeypatch, *again.split()[2:]) == 0
+    assert exit_code(monkeypatch, *again.split()[2:]) == 0
     assert "identical to the last bit" in capsys.readouterr().out
 
 
@@ -110,7 +110,7 @@ def test_a_run_keeps_its_code_and_flies_again_from_it(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = file.parent / "run"
-    assert code_of(monkeypatch, "fly", "pair.toml", "--virtual", "--allow-code", "--out", "run") in (0, 1)
+    assert exit_code(monkeypatch, "fly", "pair.toml", "--virtual", "--allow-code", "--out", "run") in (0, 1)
     (file.parent / "own.py").unlink()
     [code] = coded(MARKS, law="soft").code
     recorded = [{"file": "own.py", "sha256": code.sha256}]

@@ -22,7 +22,7 @@ CHAIN = "scenarios/chain3.toml"
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
-    """The folder of a run, whole; `{run}` in arguments."""
+    """The folder of a complete run, which arguments name as `{run}`."""
     folder = tmp_path / "run"
     folder.mkdir()
     scenario = line(3)
@@ -31,15 +31,15 @@ def run(tmp_path: Path) -> Path:
 
 
 def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    """What a command says that refuses its input: one line and nothing else."""
+    """What a command prints when it refuses its input: one line and nothing else."""
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr()
-    assert (ended.value.code, told.out) == (2, "")
-    assert told.err.count("\n") == 1
-    return told.err
+    printed = capsys.readouterr()
+    assert (ended.value.code, printed.out) == (2, "")
+    assert printed.err.count("\n") == 1
+    return printed.err
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_what_cannot_be_used_is_refused_before_the_work(
 
 
 @pytest.mark.parametrize("options", ["--front", "--at 0.3", "--front --method graph-dk"])
-def test_a_method_that_cannot_search_for_delays_is_refused_there(
+def test_a_method_that_cannot_search_for_delays_is_refused(
     options: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (FOLDER / "chain3_bidirectional.toml").read_text(encoding="utf-8")
@@ -139,7 +139,7 @@ DAMAGED = {
     ("name", "what"),
     [
         *itertools.product([DESIGN_FILE, PARQUET_FILE, SCENARIO_FILE], DAMAGED),
-        # in a growing file less than a line or a row is nothing yet
+        # in these growing files, less than a whole line or row is not damage
         *itertools.product([EVENTS_FILE], ["a word for a number", "bytes"]),
         (TICKS_FILE, "bytes"),
     ],
@@ -166,7 +166,7 @@ def test_a_damaged_file_of_a_run_is_named_by_replay(
 
 
 @pytest.mark.parametrize("what", DAMAGED)
-def test_replay_and_monitor_name_a_file_without_design(
+def test_replay_and_monitor_name_a_design_they_cannot_read(
     what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     design = run / "other.json"
@@ -176,7 +176,7 @@ def test_replay_and_monitor_name_a_file_without_design(
 
 
 @pytest.mark.parametrize("what", ["bytes", "nothing", "another JSON", "of no kind", "a folder", "not there"])
-def test_a_truth_log_that_is_none_is_named_by_grade(
+def test_an_unreadable_truth_log_is_named_by_grade(
     what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if what == "a folder":
@@ -203,38 +203,38 @@ def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str)
 def test_a_picture_is_a_png_within_the_recording(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def told(*options: str) -> str:
+    def refusal(*options: str) -> str:
         return complaint(capsys, monkeypatch, "view", str(run), *options)
 
     finish(run)
     record_run(run)
-    assert "a.jpg, wanted a name that ends in .png" in told("--picture", str(run / "a.jpg"))
-    line = told("--picture", str(run / "a.png"), "--at", "999")
+    assert "a.jpg, wanted a name that ends in .png" in refusal("--picture", str(run / "a.jpg"))
+    line = refusal("--picture", str(run / "a.png"), "--at", "999")
     assert "--at: read 999, wanted seconds from 0: " in line
     assert line.endswith(f"is {0.02 * 99:g} s long\n")
     (run / "flight.rrd").write_bytes((run / "flight.rrd").read_bytes()[:5000])
-    assert "flight.rrd: read no flight in it, wanted" in told("--picture", str(run / "a.png"))
+    assert "flight.rrd: read no flight in it, wanted" in refusal("--picture", str(run / "a.png"))
     assert not list(run.glob("a.*"))
 
 
 def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
+    """A verdict's reason can name a key of a scenario; a folder may have any name, a vehicle send any text."""
     scenario = line(2)
     summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100).ravel(), [])
     reason = "refused: give [response] in [/the scenario] :warning:"
     print_summary(summary.model_copy(update={"reason": reason}), Path("[bold]"))
-    told = capsys.readouterr().out
-    assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in told
-    assert "files    [bold]: " in told
+    printed = capsys.readouterr().out
+    assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in printed
+    assert "files    [bold]: " in printed
 
 
-def test_an_empty_connect_is_no_leave_to_start_vehicles(
+def test_an_empty_connect_does_not_start_vehicles(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "--connect: read '', wanted HOST:PORT" in complaint(capsys, monkeypatch, "fly", CHAIN, "--connect", "")
 
 
-def test_a_name_too_long_for_a_file_is_one_line(
+def test_a_name_too_long_for_a_file_is_refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "File name too long, wanted" in complaint(capsys, monkeypatch, "view", "a" * 300)

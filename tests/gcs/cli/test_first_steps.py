@@ -1,4 +1,4 @@
-"""From nothing to an own answer: new scenarios, what they would fly, and flights in virtual time."""
+"""A user's first steps: new scenarios, checks of what they would fly, and flights in virtual time."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ from scenarios.files import load, parse
 from scenarios.schema import Scenario
 from scenarios.shipped import columns, copied, names
 
-pytestmark = pytest.mark.xdist_group("processes")  # the observer
+pytestmark = pytest.mark.xdist_group("processes")  # flights start an observer process
 
 
 def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
@@ -50,18 +50,18 @@ def test_new_columns_fly_in_their_places(count: int, length: int, tmp_path: Path
     assert len({v.place_ne_m for v in found.vehicles}) == count * length
 
 
-def test_the_commands_foretold_are_those_of_the_first_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Up to what extrapolation makes of vehicles on the launcher, which report 25 m/s and do not move: one period of it
+def test_a_check_shows_the_commands_of_the_first_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the launcher vehicles report 25 m/s and do not move. Extrapolation thus errs by up to one period of that speed
     in every spacing error, times K3 = 5.6 1/s²."""
     monkeypatch.chdir(tmp_path)
     assert gcs(monkeypatch, "new", "five.toml", "--chain", "5") == 0
     assert gcs(monkeypatch, "fly", "five.toml", "--virtual", "--out", "run", "--json") == 0
-    foretold = {v.system_id: v.command_m_s2 for v in check(flight_plan(load(Path("five.toml")))[1]).vehicles}
+    expected = {v.system_id: v.command_m_s2 for v in check(flight_plan(load(Path("five.toml")))[1]).vehicles}
     ticks = read_ticks(tmp_path / "run")
-    first = ticks[ticks["commanded"]][: len(foretold)]
+    first = ticks[ticks["commanded"]][: len(expected)]
     size = np.hypot(first["command_north_m_s2"], first["command_east_m_s2"])
     for system_id, flown in zip(first["system_id"].tolist(), size.tolist(), strict=True):
-        assert flown == pytest.approx(foretold[system_id], abs=25.0 * 0.02 * 5.7)
+        assert flown == pytest.approx(expected[system_id], abs=25.0 * 0.02 * 5.7)
 
 
 def test_a_virtual_flight_leaves_the_files_of_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -84,7 +84,7 @@ def test_a_virtual_flight_leaves_the_files_of_a_real_one(tmp_path: Path, monkeyp
     assert {84, 32, 111} <= {frame.msg_id for _, frame in frames}  # set-points, positions, TIMESYNC
 
 
-def test_names_of_shipped_scenarios_are_taken_in_place_of_files(
+def test_names_of_shipped_scenarios_are_accepted_in_place_of_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -133,15 +133,15 @@ def test_check_says_between_which_delays_a_predicted_loop_is_stable(
         ("new mine.toml --chain 3 --like chain3", "read several of --like, --chain and --columns"),
     ],
 )
-def test_what_cannot_be_used_is_one_line(
+def test_unusable_arguments_are_refused_in_one_line(
     arguments: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there.toml").touch()
     assert gcs(monkeypatch, *arguments.split()) == 2
-    told = capsys.readouterr().err
-    assert wanted in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert wanted in printed
+    assert printed.count("\n") == 1
     assert [file.name for file in tmp_path.iterdir()] == ["there.toml"]
 
 
@@ -150,8 +150,8 @@ def test_check_names_a_response_that_simulated_autopilots_do_not_have(
 ) -> None:
     file = tmp_path / "copters.toml"
     given = "\n[response]\nlag_s = {}\nvelocity_gain_1_s = 2.0\n"
-    for lag_s, told in ((0.1, True), (0.15, False)):
+    for lag_s, differs in ((0.1, True), (0.15, False)):
         file.write_text(copied("copters5", "copters") + given.format(lag_s), encoding="utf-8")
         assert gcs(monkeypatch, "check", file) == 0
         line = "response lag_s 0.1, for which the control is designed: the simulated autopilots have 0.15"
-        assert (line in capsys.readouterr().out) == told
+        assert (line in capsys.readouterr().out) == differs

@@ -12,7 +12,7 @@ from scenarios.files import dump, load
 from scenarios.keys.link import Link, Links, Outage, VehicleLinks
 from tests.support.paths import SCENARIOS
 
-pytestmark = pytest.mark.xdist_group("processes")  # the observer
+pytestmark = pytest.mark.xdist_group("processes")  # flights start an observer process
 
 
 def fly(
@@ -70,7 +70,7 @@ def test_a_vehicle_that_does_not_confirm_the_end_fails(
         ("--link-delay", "61", "--link-delay: read 61, wanted seconds from 0 to 60"),
     ],
 )
-def test_what_no_flight_can_show_is_refused_before_it(
+def test_bad_options_are_refused_before_the_flight(
     option: str,
     value: str,
     wanted: str,
@@ -105,7 +105,7 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
 def test_a_check_is_no_gate_for_autopilots_not_yet_identified(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Their margin is 600 ms if they respond at once, 445 ms as they do."""
+    """Their margin is 600 ms if they respond at once, 445 ms with their actual response."""
     monkeypatch.setattr("sys.argv", ["gcs", "check", "copters5", "--link-delay", "0.23", "--assert-headroom", "0.1"])
     with pytest.raises(SystemExit) as ended:
         main()

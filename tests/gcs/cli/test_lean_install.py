@@ -37,7 +37,7 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def test_run_without_rerun_is_whole_but_for_its_recording(
+def test_run_without_rerun_is_complete_except_for_its_recording(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     without(monkeypatch, "rerun")
@@ -49,7 +49,7 @@ def test_run_without_rerun_is_whole_but_for_its_recording(
     assert capsys.readouterr().err == wanted
 
 
-def test_last_line_names_the_page_where_no_viewer_is(
+def test_last_line_names_the_report_if_no_viewer_is_installed(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     without(monkeypatch, "rerun")
@@ -78,9 +78,9 @@ def test_missing_extra_is_named_in_one_line(
 ) -> None:
     without(monkeypatch, module)
     assert gcs(monkeypatch, *command.format(run=run, scenarios=SCENARIOS).split()) == 2
-    told = capsys.readouterr().err
-    assert wanted in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert wanted in printed
+    assert printed.count("\n") == 1
 
 
 def test_campaign_without_matplotlib_has_a_report_without_figures(
@@ -91,9 +91,9 @@ def test_campaign_without_matplotlib_has_a_report_without_figures(
     file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0})), encoding="utf-8")
     out = tmp_path / "out"
     assert gcs(monkeypatch, "stress", file, "--delay", "0.1", "--workers", "1", "--out", out) == 0
-    told = capsys.readouterr().err
-    assert "no figures: the package matplotlib is not installed" in told
-    assert "flights  2, 24 s in all: about " in told
+    printed = capsys.readouterr().err
+    assert "no figures: the package matplotlib is not installed" in printed
+    assert "flights  2, 24 s in all: about " in printed
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "<img" not in page
     assert "All points" in page

@@ -1,4 +1,4 @@
-"""`gcs margin` from the outside: its JSON, its table, its exit codes, its time."""
+"""`gcs margin` from the outside: its JSON, its table, its exit codes, what it imports."""
 
 import json
 import subprocess
@@ -58,8 +58,8 @@ def test_command_ends_with_2_and_one_line_on_bad_input(tmp_path: Path) -> None:
     assert done.stderr == f"{file}: A0: read 1x2, wanted a square matrix\n"
 
 
-def test_commands_libraries_are_only_those_it_needs(tmp_path: Path) -> None:
-    # the optimiser, SciPy, the recorder and the schema of scenarios would each cost a large part of the whole answer
+def test_command_imports_only_the_libraries_it_needs(tmp_path: Path) -> None:
+    # the optimiser, SciPy, the recorder or the schema of scenarios would each take a large part of the command's time
     heavy = ("scipy", "cvxpy", "clarabel", "rerun", "rich", "scenarios.schema")
     code = (
         "import sys; sys.argv = ['gcs', 'margin', sys.argv[1], '--json']\n"
@@ -82,13 +82,13 @@ def test_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> None
         margin_of_file(file)
 
 
-def test_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+def test_byte_order_mark_is_accepted(tmp_path: Path) -> None:
     file = tmp_path / "model.json"
     file.write_text(json.dumps(CLASSIC), encoding="utf-8-sig")
     assert margin_fields(margin_of_file(file))["unknown"] == "tau"
 
 
-def test_terms_with_one_delay_are_the_pair() -> None:
+def test_terms_with_one_delay_equal_a0_and_a1() -> None:
     terms = [{"A": CLASSIC["A0"], "delay": 0}, {"A": CLASSIC["A1"], "delay": "T"}]
     assert result_of({"terms": terms}) == {**result_of(CLASSIC), "unknown": "T"}
 
@@ -98,7 +98,7 @@ def test_multiples_of_the_unknown_scale_it(delay: str, scale: float) -> None:
     result = result_of({"terms": [{"A": CLASSIC["A0"], "delay": 0}, {"A": CLASSIC["A1"], "delay": delay}]})
     assert result["delay_margin_s"] == pytest.approx(CLASSIC_MARGIN_S / scale, rel=1e-13)
     [crossing] = result["crossings"]
-    # the same crossing returns after a turn of omega times the delay, not of omega times the unknown
+    # the crossing repeats after a turn of omega times the delay, not of omega times the unknown
     assert crossing["repeats_every_s"] == pytest.approx(2.0 * pi / crossing["omega_rad_s"] / scale, rel=1e-13)
 
 
@@ -156,7 +156,7 @@ def test_held_loop_may_need_a_long_period() -> None:
 
 
 def test_held_loop_that_is_never_stable_has_no_window() -> None:
-    # x'' = -x - x(sample) / 2: the radius touches one at whole turns, of which rounding once made windows
+    # x'' = -x - x(sample) / 2: the radius touches one at whole turns, where rounding once produced windows
     result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[-0.5, 0]], "hold": True})
     assert result["stable_intervals_s"] == []
 
@@ -196,7 +196,7 @@ def test_loop_at_the_edge_of_delay_independence_has_no_limit() -> None:
 
 
 def test_fast_and_slow_loops_side_by_side() -> None:
-    # 1e10 turns of the fast one in a turn of the slow one were once all listed
+    # once, all 1e10 turns of the fast loop within one turn of the slow loop were listed
     result = result_of({"A0": [[0, 0], [0, 0]], "A1": [[-1e-8, 0], [0, -100]]})
     assert result["delay_margin_s"] == pytest.approx(pi / 200.0, rel=1e-14)
 
@@ -212,7 +212,7 @@ def test_small_loops_are_confirmed_by_two_other_methods() -> None:
 
 
 def test_disagreement_is_an_error_of_its_own() -> None:
-    # bad input ends with 2 by way of BadModelError: a contradiction must not be taken for it
+    # BadModelError means bad input, exit code 2: a disagreement of methods must not be reported as that
     assert not issubclass(DisagreementError, BadModelError)
 
 
@@ -266,12 +266,12 @@ def test_a_scenario_that_predicts_has_its_windows_too(tmp_path: Path, capsys: py
     assert f"{1e3 * least_s:.1f}" in shown
 
 
-def test_a_scenario_whose_vehicles_answer_late_is_refused() -> None:
+def test_a_scenario_whose_vehicles_respond_with_lag_is_refused() -> None:
     with pytest.raises(ModelFileError, match="dynamics: read 'autopilot', wanted double_integrator"):
         margin_of_scenario(SCENARIOS / "copters5.toml")
 
 
-def test_an_aircraft_without_response_is_told_where_its_margin_is(tmp_path: Path) -> None:
+def test_an_aircraft_without_response_is_refused_with_advice(tmp_path: Path) -> None:
     file, text = tmp_path / "aircraft.toml", (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
     file.write_text(text.replace("seed = 1", 'seed = 1\ndynamics = "jsbsim"', 1), encoding="utf-8")
     wanted = r"wanted a \[response\], as gcs identify prints it, for gcs design; or gcs stress --onset"
@@ -286,7 +286,7 @@ def test_matlab_file_is_read_as_its_json_would_be(tmp_path: Path) -> None:
     assert margin_of_file(tmp_path / "held.mat") == margin_of_file(tmp_path / "held.json")
 
 
-def test_file_that_is_not_matlab_is_one_line(tmp_path: Path) -> None:
+def test_file_that_is_not_matlab_is_refused(tmp_path: Path) -> None:
     (tmp_path / "bad.mat").write_bytes(b"MATLAB, but not really" * 10)
     with pytest.raises(ModelFileError, match="wanted a MATLAB file"):
         margin_of_file(tmp_path / "bad.mat")

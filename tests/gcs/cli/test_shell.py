@@ -62,7 +62,7 @@ def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
 
 
 def test_no_command_is_cut_in_the_list_of_commands() -> None:
-    """In a terminal of 80 columns; what is too long ends in three dots."""
+    """In a terminal of 80 columns, where text that is too long ends in three dots."""
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
     commands = shown.partition("Commands:\n")[2].splitlines()
     assert len(commands) == len(app.registered_commands)

@@ -1,4 +1,4 @@
-"""`gcs stress` as a user runs it: flights break where the margin says, and a wrong claim is caught."""
+"""`gcs stress` as a user runs it: the onset, resumed campaigns, refused options."""
 
 import json
 import subprocess
@@ -77,14 +77,14 @@ def test_bad_options_are_one_line_and_exit_code_2(arguments: tuple[str, ...], wa
 
 
 @pytest.mark.parametrize("option", ["--real-time", "--disturbance"])
-def test_autopilots_are_refused_where_they_do_not_fly(option: str) -> None:
+def test_options_that_autopilots_cannot_fly_are_refused(option: str) -> None:
     done = stress(SCENARIOS / "copters5.toml", "--onset", option)
     wanted = f"dynamics: read 'autopilot', wanted double_integrator with {option}\n"
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert done.stderr.endswith(wanted)
 
 
-def test_aircraft_are_refused_where_disturbances_of_errors_are_flown(tmp_path: Path) -> None:
+def test_aircraft_are_refused_with_disturbances_of_errors(tmp_path: Path) -> None:
     text = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
     file = tmp_path / "aircraft.toml"
     file.write_text(text.replace("seed = 1", 'seed = 1\ndynamics = "jsbsim"', 1), encoding="utf-8")

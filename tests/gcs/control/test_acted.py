@@ -19,7 +19,7 @@ Vector = tuple[float, float]
 
 
 def active(acceleration: Vector, velocity: Vector | None = None) -> tuple[Any, ...]:
-    """Fields of POSITION_TARGET_LOCAL_NED after a trip over the link; without velocity the mask says that."""
+    """Fields of POSITION_TARGET_LOCAL_NED after a trip over the link; the mask says whether it has a velocity."""
     north, east = velocity or (0.0, 0.0)
     mask = 0x0C3F if velocity is None else 0x0C07
     fields = (0, 0.0, 0.0, 0.0, north, east, 0.0, *acceleration, 0.0, 0.0, 0.0, mask, 1)
@@ -28,7 +28,7 @@ def active(acceleration: Vector, velocity: Vector | None = None) -> tuple[Any, .
 
 
 class Link:
-    """A vehicle that takes some set-points and reports what it follows, and the station's history of it."""
+    """A vehicle that takes some set-points and reports what it follows, and the station's history of set-points."""
 
     def __init__(self, count: int = 20, *, responds: LaglessMotion | None = None) -> None:
         self.wanted = np.random.default_rng(1).uniform(-5.0, 5.0, (count, 2))
@@ -39,7 +39,7 @@ class Link:
             self.targets.sent(START + k * PERIOD, (east, north), (north, east))
 
     def report(self, tick: int, fields: tuple[Any, ...]) -> None:
-        """A report of 30 ms after the set-point of a tick should have acted."""
+        """A report sent 30 ms after the set-point of a tick should have acted."""
         self.targets.reported(START + tick * PERIOD + DOWN + 30 * MS, fields)
 
     def of(self, tick: int) -> tuple[Vector, Vector]:
@@ -56,8 +56,8 @@ class Link:
 
 
 @pytest.mark.parametrize("responds", [LaglessMotion(), Responding(Response(0.3, 0.0))])
-def test_an_altered_history_is_that_of_what_acted(responds: LaglessMotion) -> None:
-    """Without a velocity to catch up with: the sums are those of a history in which the other one was sent."""
+def test_an_altered_history_equals_that_of_what_acted(responds: LaglessMotion) -> None:
+    """Without a velocity loop, the sums are those of a history in which the other set-point was sent."""
     altered, plain = CommandHistory(S, responds), CommandHistory(S, responds)
     for k in range(30):
         u = complex(np.sin(k), np.cos(k))
@@ -109,8 +109,8 @@ def test_a_delivery_longer_than_assumed_is_not_loss() -> None:
     assert all(link.gained_m_s(k) == pytest.approx(link.wanted_m_s2(k), abs=1e-9) for k in range(19))
 
 
-def test_autopilots_are_recognised_by_what_they_leave_as_it_was() -> None:
-    """ArduPilot's velocity has grown since, and a float32 in cm rounds its acceleration; PX4's is of its own loop."""
+def test_set_points_are_recognised_by_what_autopilots_leave_unchanged() -> None:
+    """ArduPilot has integrated its velocity and rounds its acceleration to float32 in cm; PX4's is of its own loop."""
     ardupilot, px4 = Link(), Link()
     for tick, held in ((3, 3), (4, 4), (5, 4), (6, 4), (7, 7), (8, 7)):
         acceleration, velocity = ardupilot.of(held)
@@ -122,7 +122,7 @@ def test_autopilots_are_recognised_by_what_they_leave_as_it_was() -> None:
         assert link.gained_m_s(tick) == pytest.approx(link.wanted_m_s2(held), abs=1e-6)
 
 
-def test_what_an_autopilot_reports_of_its_own_changes_nothing() -> None:
+def test_an_autopilots_own_target_changes_nothing() -> None:
     link = Link()
     link.report(3, active(*link.of(3)))
     link.report(4, active((9.0, 9.0), (9.0, 9.0)))
@@ -143,8 +143,8 @@ def test_set_points_under_way_are_clipped_like_the_last_one() -> None:
     assert link.gained_m_s(9) == pytest.approx(link.wanted_m_s2(9), abs=1e-6)
 
 
-def test_a_limit_of_speed_changes_nothing_under_way() -> None:
-    """It takes away what is along the velocity: what is left has another direction than the set-point."""
+def test_a_speed_limit_changes_no_set_points_under_way() -> None:
+    """It removes the part along the velocity, so that the rest has another direction than the set-point."""
     link = Link()
     link.report(3, active(link.of(3)[0]))
     aside = 0.01j * link.wanted_m_s2(4)
@@ -163,8 +163,8 @@ def test_no_reported_number_spoils_the_history(value: float) -> None:
     assert link.gained_m_s(9) == pytest.approx(link.wanted_m_s2(9), abs=1e-9)
 
 
-def test_a_vehicle_that_stands_tells_nothing_of_set_points() -> None:
-    """It reports zeros of its own: they are not the set-point of zero that was sent just now."""
+def test_zeros_of_a_vehicle_at_rest_are_no_set_point() -> None:
+    """The zeros it reports are its own, not the set-point of zero sent just before."""
     history = CommandHistory(S)
     targets = ActiveTargets(history, period_ns=PERIOD, held_ns=S)
     for k, north in enumerate((0.0, 3.0, 4.0, 5.0)):

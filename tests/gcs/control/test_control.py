@@ -72,7 +72,7 @@ def of_each(law: FeedbackLaw) -> list[object]:
 
 
 @pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
-def test_others_fly_without_a_vehicle_returning_by_its_own_law(gain: FloatArray) -> None:
+def test_a_returning_vehicle_has_its_law_others_fly_without_it(gain: FloatArray) -> None:
     away = (False, True, False, False, False)
     returning, lost, all_there = (
         of_each(feedback_law(TREE, (gain,), gone, back))
@@ -134,7 +134,7 @@ def test_only_an_unknown_vehicle_and_its_follower_get_no_command() -> None:
     assert np.isfinite(result.command_m_s2).all(axis=1).tolist() == [True, False, True, False, True]
 
 
-def test_lost_vehicles_are_flown_around_with_everybody_in_place() -> None:
+def test_lost_vehicles_are_bridged_without_moving_those_in_place() -> None:
     place = TREE.place_ne_m()
     states = np.hstack([place + np.array([500.0, 300.0]), np.tile([40.0, 2.0], (5, 1))])
     states[[1, 3]] = np.nan
@@ -154,7 +154,7 @@ def test_followers_of_a_lost_leader_keep_the_nominal_velocity() -> None:
     assert np.isnan(result.spacing_error_m[1]).all()
 
 
-def test_with_everybody_lost_nobody_is_commanded() -> None:
+def test_if_all_vehicles_are_lost_none_is_commanded() -> None:
     result = controlled(filled(RNG.normal(size=(5, 4))), lost=(True,) * 5)
     assert np.isnan(result.command_m_s2).all()
 
@@ -194,7 +194,7 @@ def test_a_report_older_than_the_newest_changes_nothing() -> None:
 
 
 def test_a_clock_correction_between_reports_makes_no_velocity() -> None:
-    """0.2 ms at 91 m/s are 18 mm between reports 20 ms apart, which as a slope would be 1.4 m/s."""
+    """0.2 ms at 91 m/s are 18 mm between reports 20 ms apart, which would change the slope of a cubic by 1.4 m/s."""
     history = StateHistory(1)
     history.add(0, 0, (0.0, 0.0, 91.0, 0.1))
     history.add(0, 20 * MS + MS // 5, (91.0 * 0.02, 0.002, 91.2, 0.1))

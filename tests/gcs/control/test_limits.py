@@ -17,7 +17,7 @@ from tests.support.paths import SCENARIOS
 from tests.support.sim_client import parse
 
 ROUNDED = 1.0 + 1e-6
-"""What goes out is float32."""
+"""Set-points are sent as float32."""
 
 
 class Wiretap:
@@ -38,7 +38,7 @@ class Wiretap:
 
 
 def tapped(plan: FlightPlan, *, opening: float | None = None) -> Wiretap:
-    """What was sent in a flight; with an opening, that of a monitor that has opened the formation at once."""
+    """The set-points sent in a flight; with an `opening`, the monitor has opened the formation by it at once."""
     station, tap = Station(plan, start_ns=START_NS), Wiretap(Fleet(plan.scenario, START_NS))
     for _ in fly_lockstep(plan, station=station, vehicles=tap):
         if opening is not None:
@@ -60,7 +60,7 @@ def test_a_formation_opened_by_the_monitor_keeps_the_acceleration_limit(loop: st
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_copters_keep_speed_and_acceleration_limits_in_manoeuvre_and_flight(flavour: str) -> None:
-    """Speeds are held as the vehicles' targets: they grow with what is wanted, while a vehicle cannot follow."""
+    """Speed is limited in the targets sent, which grow with the commands while a vehicle cannot follow."""
     scenario, limits = three(flavour=flavour, duration_s=8.0), Limits(acceleration_max_m_s2=1.5, speed_max_m_s=4.5)
     behind: list[Vehicle] = []
     for vehicle in scenario.vehicles:

@@ -12,12 +12,12 @@ from scenarios.schema import Rates
 S, MS = 1_000_000_000, 1_000_000
 
 
-def test_it_is_state_age_plus_the_way_down_less_repetition() -> None:
+def test_loop_delay_is_state_age_plus_down_delay_less_repetition() -> None:
     assert loop_delay_s(10 * S, 10 * S + 50 * MS, 0.03, 0.01) == pytest.approx(0.07, abs=1e-12)
 
 
 @pytest.mark.parametrize(("used_ns", "down_s"), [(0, 0.03), (10 * S, nan)])
-def test_it_is_unknown_while_either_way_is(used_ns: int, down_s: float) -> None:
+def test_loop_delay_is_unknown_while_either_part_is(used_ns: int, down_s: float) -> None:
     assert isnan(loop_delay_s(used_ns, 11 * S, down_s))
 
 

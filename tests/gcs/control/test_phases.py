@@ -16,8 +16,8 @@ def test_phases_follow_each_other_in_one_order_only() -> None:
         if stop and phase in {Phase.CONNECTING, Phase.IDENTIFYING, Phase.FLYING}:
             assert after is Phase.ENDING
         elif phase is Phase.CONNECTING:
-            unidentified = Phase.FLYING if identified else Phase.IDENTIFYING
-            assert after is (unidentified if ready else Phase.CONNECTING)
+            begun = Phase.FLYING if identified else Phase.IDENTIFYING
+            assert after is (begun if ready else Phase.CONNECTING)
         elif phase is Phase.IDENTIFYING:
             assert after is (Phase.FLYING if identified else Phase.IDENTIFYING)
         elif phase is Phase.FLYING:

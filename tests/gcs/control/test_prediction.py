@@ -59,7 +59,7 @@ ACCELERATIONS = st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
     st.integers(-1000, 5000),
     st.integers(0, 10_000),
 )
-def test_states_are_extrapolated_on_as_if_each_piece_were_integrated(
+def test_states_are_predicted_as_if_each_piece_were_integrated(
     steps: list[tuple[int, tuple[float, float]]], from_ms: int, for_ms: int
 ) -> None:
     due_ms = np.cumsum([gap_ms for gap_ms, _ in steps]).tolist()
@@ -121,7 +121,7 @@ def test_without_a_state_nothing_is_predicted() -> None:
 
 
 def followed(down_s: Callable[[float], float], *, seconds: float, round_trip_s: float = 0.0) -> FloatArray:
-    """(time, delivery assumed) in s at 50 Hz; measured ten times a second, known a round trip later."""
+    """Rows (time, assumed delivery) in s at 50 Hz; a delivery is measured every 0.1 s and known a round trip later."""
     delivery, rows, asked = MeasuredDelivery(), list[tuple[float, float]](), 0
     for tick in range(round(50 * seconds)):
         now_s = 0.02 * tick

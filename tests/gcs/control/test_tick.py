@@ -16,6 +16,6 @@ ROWS["tick"], ROWS["system_id"] = np.arange(20) // 5, np.arange(20) % 5
         (ROWS["system_id"] > 2, True), (np.arange(20)[::-1], True), (np.array([4, 4]), True), (np.array([7]), True),
     ],
 )  # fmt: skip
-def test_chosen_rows_are_those_of_numpy_equally_spaced_ones_uncopied(which: np.ndarray, copied: bool) -> None:
+def test_chosen_rows_match_numpy_without_copies_if_equally_spaced(which: np.ndarray, copied: bool) -> None:
     assert chosen(ROWS, which).tolist() == ROWS[which].tolist()
     assert np.shares_memory(chosen(ROWS, which), ROWS) is not copied

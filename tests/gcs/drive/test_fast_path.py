@@ -1,4 +1,4 @@
-"""What kernels do alone, and the steps in Python, are the same flight."""
+"""Kernels alone, and steps in Python, fly the same flight."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +26,7 @@ SILENT = {"outages": (Outage(from_s=2.0, until_s=4.5),)}
 
 @dataclass
 class StepByStep:
-    """Vehicles whose steps a driver cannot see through."""
+    """Vehicles in a wrapper, which makes the driver take their steps in Python."""
 
     vehicles: Vehicles
 
@@ -35,7 +35,7 @@ class StepByStep:
 
 
 class Counting(Station):
-    """A station that counts its steps in Python, and does them without the kernel of a usual tick if asked."""
+    """A station that counts its steps in Python; `plainly` turns off the kernel for usual ticks."""
 
     steps, plainly = 0, False
 

@@ -1,4 +1,4 @@
-"""A prepared flight compiles nothing: that would take seconds in which vehicles hear nothing."""
+"""A prepared flight compiles nothing: a compilation takes seconds in which vehicles hear nothing."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ from tests.support.paths import SCENARIOS
 
 def compiled():
     kernels = [each for each in gc.get_objects() if type(each).__name__ == "_Kernel" and each._compiled is not None]
-    # in real time, the vehicles' run in a process of their own
+    # in real time, the vehicles' kernels run in a process of their own
     ours = [each for each in kernels if each._name.startswith(("gcs.", "scenarios.sockets."))]
     return {each._name: len(each._compiled.signatures) for each in ours}
 

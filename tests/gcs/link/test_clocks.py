@@ -96,12 +96,12 @@ def test_the_clock_outlasts_a_queue_longer_than_its_window() -> None:
     for k in range(300):  # the queue begins after 20 s
         queue_ns = 0 if k < 40 else round(rng.uniform(20.0, 120.0) * MS)
         truth.at(k * S // 2, down_ns=14 * MS, up_ns=14 * MS + queue_ns)
-    # a line through the window alone is off by 10 to 25 ms; the last one before that drifts by 33e-6 for 70 s
+    # a line through the window alone is off by 10 to 25 ms; the line from before the queue drifts by 33e-6 for 70 s
     assert abs(truth.error_ns(150 * S)) < 5 * MS
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_limits_of_different_exchanges_outdo_the_best_one(seed: int) -> None:
+def test_combined_limits_of_exchanges_beat_the_best_single_one(seed: int) -> None:
     """Uniform jitter of +-30 ms on both ways."""
     rng, truth = np.random.default_rng(seed), Exchange(offset_ns=5 * S, drift=20e-6)
     offs_ns: list[float] = []
@@ -109,13 +109,13 @@ def test_limits_of_different_exchanges_outdo_the_best_one(seed: int) -> None:
         down_ns, up_ns = (round(rng.uniform(70.0, 130.0) * MS) for _ in range(2))
         truth.at(k * S // 10, down_ns=down_ns, up_ns=up_ns)
         offs_ns.append(truth.error_ns(k * S // 10 + down_ns + up_ns))
-    # The least of 128 is 60 / 129 ms on average above the fastest; four times that is passed once in e^4 = 55 windows;
-    # the error is half the difference of two such.
+    # The least of 128 delays is on average 60 / 129 ms above the minimum; four times that is exceeded once in e^4 = 55
+    # windows. The error is half the difference of two such.
     assert np.abs(offs_ns[128:]).max() < 4 * 60 / 129 * MS
 
 
 def test_one_way_slowing_down_does_not_shift_the_clock() -> None:
-    """By 1.5 s within a minute, which a line through the exchanges of the window would follow."""
+    """It slows down by 1.5 s within a minute, which a line through the exchanges of the window would follow."""
     rng, truth = np.random.default_rng(1), Exchange(offset_ns=5 * S, drift=20e-6)
     for k in range(700):
         jitter_ns = [round(rng.uniform(0.0, 5.0) * MS) for _ in range(2)]
@@ -126,8 +126,8 @@ def test_one_way_slowing_down_does_not_shift_the_clock() -> None:
 
 
 @pytest.mark.parametrize("begin_ms", range(20_000, 20_500, 25))
-def test_exchanges_during_changes_of_both_ways_leave_the_clock(begin_ms: int) -> None:
-    """Both ways slow down within 0.5 s. When earlier exchanges leave the window, asymmetric ones are its quickest."""
+def test_asymmetric_exchanges_during_a_slowdown_do_not_shift_the_clock(begin_ms: int) -> None:
+    """Both ways slow down within 0.5 s. Once earlier exchanges have left the window, its quickest are asymmetric."""
     truth = Exchange(offset_ns=5 * S, drift=10e-6)
     truth.clock.expected_error_ns = 5 * MS
 
@@ -144,7 +144,7 @@ def test_exchanges_during_changes_of_both_ways_leave_the_clock(begin_ms: int) ->
     assert max(offs_ns[50:]) < 0.2 * MS
 
 
-def test_first_states_tell_what_few_exchanges_leave_open() -> None:
+def test_first_states_narrow_what_few_exchanges_leave_open() -> None:
     """Five exchanges whose replies all queued; the states between them did not."""
     seen, unseen = Exchange(offset_ns=5 * S, drift=0.0), Exchange(offset_ns=5 * S, drift=0.0)
     for k in range(5):
@@ -349,9 +349,9 @@ def test_time_boot_ms_wraps_after_49_days_in_the_air() -> None:
 
 
 def lying(*, usual_ms: int, share: float, slips: bool = False, minutes: int = 10, seed: int = 5) -> dict[str, float]:
-    """What direct links show of a clock whose replies are dated back by up to 3.5 ms, and that may slip.
+    """What direct links show of a clock that may slip and whose replies are dated back by up to 3.5 ms.
 
-    Shares of the exchanges after which an instant, or a loop delay, is wrong by more than its bound.
+    `outside` and `wrong`: shares of exchanges after which an instant, or a loop delay, is off by more than its bound.
     """
     rng, truth = np.random.default_rng(seed), Exchange(offset_ns=7 * S, drift=30e-6)
     clock, outside, wrong, least_up_ns = truth.clock, 0, 0, S
@@ -380,7 +380,7 @@ def lying(*, usual_ms: int, share: float, slips: bool = False, minutes: int = 10
 @pytest.mark.parametrize("slips", [False, True])
 @pytest.mark.parametrize("share", [0.12, 0.47, 1.0])
 def test_errors_usual_for_the_kind_keep_bounds_without_jumps(share: float, slips: bool) -> None:
-    """Ten minutes at the error of ArduCopter; 12 and 47 % of exchanges are what was seen to contradict the others."""
+    """Ten minutes with ArduCopter's errors, where 12 and 47 % of the exchanges were seen to contradict the others."""
     found = lying(usual_ms=5, share=share, slips=slips)
     assert found["jumps"] == 0
     assert found["outside"] == found["wrong"] == 0.0
@@ -390,7 +390,7 @@ def test_errors_usual_for_the_kind_keep_bounds_without_jumps(share: float, slips
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("share", [0.12, 0.47])
 def test_unforeseen_errors_are_learnt_and_are_no_jumps(share: float, seed: int) -> None:
-    """Before an error has shown, no bound can hold it: a few at the beginning, 1 % of three minutes at most."""
+    """No bound covers an error not seen yet: a few exchanges exceed it at first, at most 1 % in three minutes."""
     found = lying(usual_ms=0, share=share, minutes=3, seed=seed)
     assert found["jumps"] == 0
     assert max(found["outside"], found["wrong"]) < 0.01

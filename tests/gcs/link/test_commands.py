@@ -1,4 +1,4 @@
-"""Commands and their answers, which do not say what they answer."""
+"""Commands and their answers, which do not say to which request they belong."""
 
 from collections import Counter
 
@@ -32,7 +32,7 @@ def asked_twice() -> RemoteVehicle:
     return vehicle
 
 
-def test_second_answer_to_a_request_is_none_to_the_next() -> None:
+def test_a_second_answer_does_not_answer_the_next_request() -> None:
     vehicle = asked_twice()
     vehicle.acknowledge(ACCEPTED, NS_PER_S + 3)
     assert requested(vehicle.next_frame(2 * NS_PER_S + 2)) == mavlink.POSITION_TARGET_LOCAL_NED
@@ -74,7 +74,7 @@ def test_vehicle_with_nothing_left_to_command_awaits_timesync_answers() -> None:
 
 
 def stranger() -> tuple[RemoteVehicle, list[int]]:
-    """A vehicle that has to say that it is simulated, and the ids of what it is sent in twenty seconds."""
+    """A vehicle that has to say that it is simulated, and the ids of the messages sent to it in twenty seconds."""
     vehicle, sent = RemoteVehicle(7, startup=LaunchedStartup(50.0, stranger=True)), list[int]()
     vehicle.address = 1
     for k in range(400):
@@ -84,7 +84,7 @@ def stranger() -> tuple[RemoteVehicle, list[int]]:
     return vehicle, sent
 
 
-def test_a_stranger_is_asked_and_commanded_nothing() -> None:
+def test_a_stranger_is_only_asked_whether_it_is_simulated() -> None:
     vehicle, sent = stranger()
     assert {*sent} == {mavlink.PARAM_EXT_REQUEST_READ}
     assert vehicle.startup.refusal.startswith("does not say that it is simulated, wanted")

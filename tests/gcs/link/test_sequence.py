@@ -14,7 +14,7 @@ MS = 1_000_000
 
 
 def counted(numbers: list[int], times_ms: Iterable[float] | None = None) -> SequenceCounter:
-    """Frames that were received at these times, or each 20 ms after the one before it."""
+    """The counter after frames received at these times, by default 20 ms apart."""
     counter = SequenceCounter()
     for number, time_ms in zip(numbers, times_ms or itertools.count(0, 20), strict=times_ms is not None):
         counter.add(number & 0xFF, round(time_ms * MS))
@@ -67,7 +67,7 @@ def test_losses_in_outages_up_to_a_minute_are_counted_whole(
     assert counter.duplicate == 0
 
 
-def test_frames_overtaken_by_two_hundred_are_neither_lost_nor_doubled() -> None:
+def test_frames_overtaken_by_two_hundred_are_neither_lost_nor_duplicates() -> None:
     """50 frames a second, each up to 3 s late: the signed difference of two numbers would be wrong by 256."""
     rng = np.random.default_rng(4)
     arrival_ms = 20.0 * np.arange(4000) + rng.uniform(0.0, 3000.0, 4000)

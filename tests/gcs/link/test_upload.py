@@ -32,7 +32,7 @@ class Holder:
 def test_done_means_read_back_right_despite_loss_delay_and_repeats(
     fates: list[tuple[bool, bool, int, bool]],
 ) -> None:
-    """Each frame's fate: lost on its way there, lost on its way back, ms until the answer is here, and twice."""
+    """Each frame's fate: lost on the way there, lost on the way back, ms until the answer arrives, answered twice."""
     upload, holder = Upload(NUMBERS), Holder()
     under_way: list[tuple[int, tuple[object, ...]]] = []
     fate = iter(fates)
@@ -53,7 +53,7 @@ def test_done_means_read_back_right_despite_loss_delay_and_repeats(
     pytest.fail("never done, though nothing was lost any more")
 
 
-def test_numbers_are_compared_as_they_travel() -> None:
+def test_numbers_are_compared_as_float32() -> None:
     assert float32(0.1) != 0.1
     upload, holder = Upload({"FORM_B": 0.1}), Holder()
     for now_ns in (0, 20 * MS):
@@ -64,13 +64,13 @@ def test_numbers_are_compared_as_they_travel() -> None:
     assert upload.next(40 * MS, target_system=1, rtt_ns=0) is None
 
 
-@pytest.mark.parametrize("told", [-17.0088, float("nan")])
-def test_vehicles_that_keep_reading_otherwise_are_refused_in_one_line(told: float) -> None:
+@pytest.mark.parametrize("reported", [-17.0088, float("nan")])
+def test_vehicles_that_keep_another_value_are_refused_in_one_line(reported: float) -> None:
     upload = Upload({"FORM_A": -17.0089})
     for attempt in range(ATTEMPTS):
         assert not upload.refusal
         assert upload.next(attempt * 20 * MS, target_system=1, rtt_ns=0) is not None
-        upload.take((told, 1, 0, b"FORM_A".ljust(16, b"\0"), 9))
+        upload.take((reported, 1, 0, b"FORM_A".ljust(16, b"\0"), 9))
     assert upload.refusal.startswith("holds ")
     assert "\n" not in upload.missing
     assert not upload.done

@@ -12,8 +12,8 @@ from gcs.views.console import plain_console
 from gcs.views.report import print_design
 from scenarios.errors import ScenarioError
 from scenarios.files import load, parse
+from tests.support.paths import SCENARIOS
 
-SCENARIOS = Path(__file__).parents[3] / "scenarios"
 CHAIN = (SCENARIOS / "chain3.toml").read_text()
 GRAPH = (SCENARIOS / "chain3_bidirectional.toml").read_text()
 
@@ -76,7 +76,7 @@ def test_criteria_are_refused_for_the_loop_on_board() -> None:
         parse(text, Path("scenario.toml"))
 
 
-def test_overlaps_give_vehicles_more_to_hear() -> None:
+def test_overlaps_let_vehicles_hear_more_vehicles() -> None:
     text = GRAPH.replace("hears = [2]\n", "").replace("hears = [3]\n", "")
     scenario = parse(text.replace("[links]", "[control.overlap]\nahead = 2\n\n[links]"), Path("scenario.toml"))
     found = flight_plan(scenario)[0]

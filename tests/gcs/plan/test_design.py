@@ -37,7 +37,7 @@ def test_a_design_cannot_be_changed() -> None:
         Design(delay_margin_s=0.3).alpha = 1.0  # pyrefly: ignore[read-only]
 
 
-def test_endless_margins_are_none_and_missing_parts_are_not_written() -> None:
+def test_infinite_margins_are_none_and_missing_parts_not_written() -> None:
     design = Design(delay_margin_s=np.inf)
     assert design.to_dict() == {"delay_margin_s": None}
     assert design.margins_s == (np.inf,)

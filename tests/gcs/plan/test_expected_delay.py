@@ -37,7 +37,7 @@ def over(jitter: Jitter, delay_s: float) -> Scenario:
     ],
     ids=["uniform", "normal", "lte"],
 )
-def test_expected_and_late_loop_delay_are_those_of_flights(scenario: Scenario) -> None:
+def test_expected_and_p99_loop_delay_are_those_of_flights(scenario: Scenario) -> None:
     flown = fly_virtual(scenario).summary
     slowest_s, latest_s = (max(getattr(own.loop_delay_s, at) for own in flown.vehicles) for at in ("p50", "p99"))
     # 450 down delays and three phases: 2 % of standard error
@@ -47,7 +47,7 @@ def test_expected_and_late_loop_delay_are_those_of_flights(scenario: Scenario) -
 
 @pytest.mark.parametrize("prediction", ["off", "measured"])
 @pytest.mark.parametrize("name", ["chain3", "thesis_delay"], ids=["on the ground", "on board"])
-def test_late_headroom_is_that_of_flights(name: str, prediction: Prediction) -> None:
+def test_p99_headroom_is_that_of_flights(name: str, prediction: Prediction) -> None:
     scenario = load(FOLDER / f"{name}.toml").with_calm_monitor()
     control = scenario.control.model_copy(update={"prediction": prediction})
     link = Link(delay_s=0.05, jitter=Jitter(distribution="uniform", scale_s=0.05))
@@ -61,7 +61,7 @@ def test_late_headroom_is_that_of_flights(name: str, prediction: Prediction) -> 
     assert (expected.headroom_p99 or 0.0) < (expected.headroom or 0.0) - 0.02  # the median tells nothing of jitter
 
 
-def test_jitter_that_is_never_negative_exceeds_its_mean() -> None:
+def test_jitter_cut_off_at_zero_lengthens_the_expected_delay() -> None:
     assert expected_loop_delay_s(over(Jitter(distribution="uniform", scale_s=0.05), 0.005)) > 0.04
 
 
@@ -77,11 +77,11 @@ def test_on_board_the_slowest_state_that_a_command_needs_counts(name: str, expec
     scenario = with_loop(load(file), "onboard", file).model_copy(update={"links": links, "duration_s": 10.0})
     assert list(planned_loop_delays_s(flight_plan(scenario)[1]).values()) == pytest.approx(expected_s)
     flown_s = [own.loop_delay_s.p50 for own in fly_virtual(scenario).summary.vehicles]
-    assert flown_s == pytest.approx(expected_s, abs=0.01)  # half of a period, as phases happen to be
+    assert flown_s == pytest.approx(expected_s, abs=0.01)  # half a period, depending on the phases
 
 
 def test_on_board_states_of_different_instants_are_waited_for() -> None:
-    """With slow telemetry the phases at which vehicles report decide, which differ from flight to flight."""
+    """With slow telemetry the result depends on the phases at which vehicles report, which differ between flights."""
     scenario = load(FOLDER / "thesis_delay.toml").with_calm_monitor()
     slow = scenario.model_copy(
         update={"rates": scenario.rates.model_copy(update={"telemetry_hz": 5.0}), "duration_s": 10.0}
@@ -95,7 +95,7 @@ def test_on_board_states_of_different_instants_are_waited_for() -> None:
 
 
 @pytest.mark.parametrize("telemetry_hz", [50.0, 10.0])
-def test_where_datagrams_are_lost_older_commands_act_on(telemetry_hz: float) -> None:
+def test_where_datagrams_are_lost_older_commands_keep_acting(telemetry_hz: float) -> None:
     calm = calm_chain()
     link = Link(delay_s=0.03, loss_probability=0.3)
     rates = calm.rates.model_copy(update={"telemetry_hz": telemetry_hz})
@@ -105,7 +105,7 @@ def test_where_datagrams_are_lost_older_commands_act_on(telemetry_hz: float) -> 
     rows = flight.ticks[(flight.ticks["time_s"] > 2.0) & (flight.ticks["time_s"] < 58.0)]
     flown_s = effective_delays_s(plan, rows, flight, plan.formation.system_ids)
     [expected_s] = set(effective_loop_delays_s(plan).values())
-    # half of a period, as phases happen to be; one vehicle is in failsafe now and then
+    # half a period, depending on the phases; one vehicle is in failsafe now and then
     assert expected_s == pytest.approx(np.median([*flown_s.values()]), abs=0.01)
     assert expected_s > 1.04 * expected_loop_delay_s(scenario)
     assert check(plan).vehicles[1].link_delay_left_s == pytest.approx(plan.delay_margin_s - expected_s)
@@ -130,7 +130,7 @@ def test_late_datagrams_count_as_lost_ones(control_hz: float, telemetry_hz: floa
 
 
 def losing(down: Link, **control: object) -> Scenario:
-    """Flown without a limit on how long set-points may stay away; at 5 Hz a lost one counts."""
+    """A flight at 5 Hz, where a lost set-point matters, without a limit on how long set-points may stay away."""
     calm = calm_chain()
     rates = calm.rates.model_copy(update={"control_hz": 5.0, "telemetry_hz": 5.0})
     safety = calm.safety.model_copy(update={"setpoint_timeout_s": 100.0, "heartbeat_timeout_s": 100.0})
@@ -153,7 +153,7 @@ def test_a_gate_fails_where_lost_set_points_break_the_flight(prediction: Predict
     assert fly_virtual(scenario).summary.verdict != "stable"
 
 
-def test_corrupt_datagrams_are_lost_ones() -> None:
+def test_corrupt_datagrams_count_as_lost_ones() -> None:
     lost, corrupt = (
         effective_loop_delays_s(flight_plan(losing(down))[1])
         for down in (Link(delay_s=0.02, loss_probability=0.5), Link(delay_s=0.02, corrupt_probability=0.5))
@@ -162,19 +162,19 @@ def test_corrupt_datagrams_are_lost_ones() -> None:
 
 
 def test_failsafes_are_expected_where_set_points_stay_away() -> None:
-    """A timeout of 0.5 s passes without any of two set-points in a row: a third of them at 5 Hz."""
+    """At 5 Hz, a timeout of 0.5 s passes when two set-points in a row are lost."""
     scenario = losing(Link(delay_s=0.02, loss_probability=0.5))
     scenario = scenario.model_copy(
         update={"safety": scenario.safety.model_copy(update={"setpoint_timeout_s": 0.5}), "seed": 3}
     )
     flown = fly_virtual(scenario)
     events = [event for event in flown.events if "set-points stopped" in str(event)]
-    # each run of two or more lost ones
+    # one for each run of two or more lost set-points
     assert check(flight_plan(scenario)[1]).setpoint_gaps == pytest.approx(3 * 60.0 * 5.0 * 0.5**3, rel=0.1)
     assert len(events) > 0
 
 
-def test_states_lost_in_bursts_are_late_ones() -> None:
+def test_states_lost_in_bursts_lengthen_the_p99_loop_delay() -> None:
     """With independent losses, states would be at most 0.14 s late for 99 % of the set-points."""
     bursts = LossBursts(to_bad_probability=0.02, to_good_probability=0.2)
     link = Link(delay_s=0.05, loss_bursts=bursts)
@@ -186,7 +186,7 @@ def test_states_lost_in_bursts_are_late_ones() -> None:
     assert expected_s > 0.2
 
 
-def test_given_delays_are_off_by_the_wait_for_the_tick() -> None:
+def test_a_given_delay_is_off_by_the_wait_for_ticks() -> None:
     """The wait is unknown before a flight and constant during it."""
     calm = calm_chain()
     rates = calm.rates.model_copy(update={"telemetry_hz": 10.0, "control_hz": 10.0})

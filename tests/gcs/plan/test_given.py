@@ -1,4 +1,4 @@
-"""Gains of one's own are those that are flown."""
+"""A gain that the user gives is the one flown."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""By how much the loop delay may miss the assumed one, at any assumed delay."""
+"""By how much the loop delay may differ from the assumed one, at any assumed delay."""
 
 from dataclasses import replace
 from functools import cache
@@ -49,8 +49,8 @@ def test_a_fixed_assumption_tolerates_the_published_mismatch() -> None:
 @pytest.mark.parametrize(
     ("assumed_s", "sampled_s", "continuous_s"),
     [
-        # the windows of both models, each as k1 = 3.408 and k3 = 5.608 have it by an independent computation of its
-        # equation, to the digit printed here
+        # the windows of both models for k1 = 3.408 and k3 = 5.608, computed independently from the equation of each, to
+        # the digits printed here
         (0.3, (0.0, 0.5429), (0.0, 0.5480)),
         (0.6, (0.4504, 0.7569), (0.4446, 0.7642)),
         (1.5, (1.4163, 1.5838), (1.4134, 1.5869)),
@@ -83,7 +83,7 @@ def test_a_window_that_begins_at_no_delay_ends_at_none() -> None:
     assert tolerated.used_s(0, -0.05) == 0.0
 
 
-def test_too_short_and_too_long_delays_use_the_same_share() -> None:
+def test_both_ends_of_a_window_use_the_same_share() -> None:
     tolerated = planned(1.5).tolerance(1.5)
     used_s = tolerated.used_s(0, -tolerated.shorter_s[0])
     assert used_s == pytest.approx(tolerated.longer_s[0])

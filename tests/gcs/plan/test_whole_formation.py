@@ -10,6 +10,6 @@ from tests.support.paths import SCENARIOS
 
 
 @pytest.mark.parametrize(("vehicles", "known"), [(1, False), (20, True), (51, False)])
-def test_a_lone_vehicle_or_large_formation_has_no_own_bound(vehicles: int, known: bool) -> None:
+def test_a_lone_vehicle_or_large_formation_has_no_formation_alpha(vehicles: int, known: bool) -> None:
     design, plan = flight_plan(without_solver(with_vehicles(load(SCENARIOS / "triangle5.toml"), vehicles), 1.0))
     assert (with_spread(design, plan).whole is not None) == known

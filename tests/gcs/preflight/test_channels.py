@@ -21,8 +21,8 @@ from tests.support.processes import gcs
 RADIO = load(SCENARIOS / "radio57600.toml").with_calm_monitor()
 
 
-def test_expected_and_late_loop_delays_are_those_of_flights() -> None:
-    """Of other seeds, hence other phases, and longer: 30 s."""
+def test_expected_and_p99_loop_delays_are_those_of_flights() -> None:
+    """The flights have other seeds, hence other phases, and are longer: 30 s."""
     found = check(flight_plan(RADIO)[1])
     medians_s, late_s = list[list[float]](), list[float]()
     for seed in range(101, 113):

@@ -12,7 +12,7 @@ GAINS = Control(gains=FixedGains(K1=-1.6, K2=0.8, K3=0.5))
 PATROL = load(SCENARIOS / "patrol.toml").model_copy(update={"control": GAINS})
 
 
-def test_a_check_tells_the_course_and_the_closest_places() -> None:
+def test_a_check_reports_the_course_and_the_closest_places() -> None:
     found = check(flight_plan(PATROL)[1])
     assert found.course is not None
     assert found.course.length_m == pytest.approx(25.0 * found.course.duration_s)
@@ -25,6 +25,6 @@ def test_vehicles_that_cannot_fly_the_plan_are_named() -> None:
     limits = Limits(speed_min_m_s=14.0, speed_max_m_s=30.0, acceleration_max_m_s2=7.0)
     found = check(flight_plan(PATROL.model_copy(update={"limits": limits}))[1])
     beyond = {motion.system_id: motion.beyond for motion in found.planned if motion.beyond}
-    # the last of both platoons are farthest out
+    # the last vehicles of both platoons fly farthest out
     assert beyond.keys() >= {3, 5}
     assert beyond[5] == ("speed_max_m_s", "acceleration_max_m_s2")

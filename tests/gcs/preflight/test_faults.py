@@ -46,17 +46,17 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr()
-    assert (ended.value.code, told.out) == (2, "")
-    assert told.err.count("\n") == 1
-    return told.err
+    printed = capsys.readouterr()
+    assert (ended.value.code, printed.out) == (2, "")
+    assert printed.err.count("\n") == 1
+    return printed.err
 
 
 @pytest.mark.parametrize(
     "command", [("design",), ("fly", "--virtual"), ("stress", "--onset"), ("design", "--loop", "onboard")]
 )
 @pytest.mark.parametrize(
-    ("gains", "told"),
+    ("gains", "wanted"),
     [
         ((3.0, 0.6, 5.6), "without any delay: root +3 1/s, vehicle 1;"),
         # s² + k1 s + k3 of each follower: roots +0.5 ± √(0.25 − 4) j
@@ -71,7 +71,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
 def test_an_unstable_loop_is_refused_with_its_root(
     command: tuple[str, ...],
     gains: tuple[float, float, float],
-    told: str,
+    wanted: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -80,7 +80,7 @@ def test_an_unstable_loop_is_refused_with_its_root(
     line = complaint(capsys, monkeypatch, command[0], str(file), *command[1:])
     number = file.read_text(encoding="utf-8")[: file.read_text(encoding="utf-8").index("gains = ")].count("\n") + 1
     assert line.startswith(f"{file}: line {number}: control.gains: read a loop that ")
-    assert told in line
+    assert wanted in line
 
 
 def test_an_unstable_coupled_loop_of_a_pattern_names_all_vehicles() -> None:
@@ -103,7 +103,7 @@ def test_a_stable_loop_beyond_its_margin_is_flown() -> None:
     assert bad_start(late) is None
 
 
-def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -> None:
+def test_an_unstable_loop_that_is_flown_shows_no_headroom(tmp_path: Path) -> None:
     from gcs.drive.flown import fly_plan
 
     designed, plan = flight_plan(load(with_gains(tmp_path, 3.0, 0.6, 5.6)))
@@ -122,8 +122,8 @@ def test_gains_of_any_size_are_assessed_and_reported(gains: tuple[float, float, 
     printed = CliRunner().invoke(app, ["design", str(file), "--allow-unstable"])
     assert printed.exit_code == 0, printed.output
     assert "none: the sampled loop is unstable without any delay" in printed.output
-    told = CliRunner().invoke(app, ["design", str(file), "--allow-unstable", "--json"])
-    assert json.loads(told.stdout)["delay_margin_s"] == 0.0
+    as_json = CliRunner().invoke(app, ["design", str(file), "--allow-unstable", "--json"])
+    assert json.loads(as_json.stdout)["delay_margin_s"] == 0.0
 
 
 def test_starts_in_collision_or_past_the_limit_are_found_beforehand(
@@ -168,7 +168,7 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "wanted"),
     [
         (
             [("up = { delay_s = 0.02 }", "up = { delay_s = 0.02, loss_probability = 1.0 }")],
@@ -186,12 +186,12 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     ],
 )
 def test_links_that_let_nothing_through_are_refused(
-    changes: list[tuple[str, str]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    changes: list[tuple[str, str]], wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     file = str(chain_file(tmp_path, *changes))
     for command in (("check",), ("fly", "--virtual")):
-        assert told in complaint(capsys, monkeypatch, *command, file)
+        assert wanted in complaint(capsys, monkeypatch, *command, file)
 
 
 def test_places_nearer_than_a_collision_are_refused() -> None:

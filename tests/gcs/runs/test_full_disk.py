@@ -1,4 +1,4 @@
-"""A disk that fills up while logs are written: no record is torn, and what was written before can be gone on with."""
+"""A disk that fills up while logs are written: no record is torn, and what was written before remains usable."""
 
 import json
 import resource
@@ -23,7 +23,7 @@ THREE = line(3)
 
 @contextmanager
 def disk_full_at(size: int) -> Generator[None]:
-    """While entered, no file of this process grows past a size."""
+    """Within this context, no file of this process grows past a size."""
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limit[1]))

@@ -1,4 +1,4 @@
-"""What did not get in is told with its reasons, seldom enough, and found again in a run."""
+"""Refused datagrams are reported by reason, not too often, and can be read back from a run."""
 
 from collections import Counter
 from pathlib import Path
@@ -9,17 +9,17 @@ from gcs.runs.record import RunWriter
 from gcs.runs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
 
 
-def test_each_reason_is_reported_once_counts_at_the_end() -> None:
+def test_reasons_are_reported_once_and_counts_at_the_end() -> None:
     refusals, counters = Refusals(), Counter[str]()
     assert refusals.news(counters) == {}
-    told: list[tuple[int, dict[str, int]]] = []
+    reported: list[tuple[int, dict[str, int]]] = []
     for k in range(50):
         counters["unsigned"] += 1
         counters["truncated"] += k >= 20
-        counters += Counter[str]()  # reasons without a count have not been met
+        counters += Counter[str]()  # removes reasons whose count is zero
         if counts := refusals.news(counters):
-            told.append((k, counts))
-    assert told == [(0, {"unsigned": 1}), (20, {"unsigned": 21, "truncated": 1})]
+            reported.append((k, counts))
+    assert reported == [(0, {"unsigned": 1}), (20, {"unsigned": 21, "truncated": 1})]
     assert refusals.news(counters, last=True) == {"unsigned": 50, "truncated": 30}
     assert refusals.news(counters, last=True) == {}
 
@@ -29,7 +29,7 @@ def test_the_vehicles_own_cameras_and_first_frames_are_no_refusals() -> None:
     assert Refusals().news(counters, last=True) == {}
 
 
-def test_a_run_tells_its_newest_counts_the_most_frequent_first(tmp_path: Path) -> None:
+def test_a_run_holds_its_newest_counts_the_most_frequent_first(tmp_path: Path) -> None:
     writer = RunWriter(tmp_path)
     for unsigned in (1, 5):
         counts = {"replayed": 2, "unsigned": unsigned}
@@ -42,7 +42,7 @@ def test_a_run_tells_its_newest_counts_the_most_frequent_first(tmp_path: Path) -
     assert counts_of([], REFUSED) == {}
 
 
-def test_what_vehicles_counted_is_read_if_it_is_there(tmp_path: Path) -> None:
+def test_what_vehicles_counted_is_read_if_it_was_written(tmp_path: Path) -> None:
     assert refused_by_vehicles(tmp_path) is None
     (tmp_path / VEHICLES_FILE).write_text('{"setpoints": 10, "refused_wrong_signature": 3, "ignored_message": 1}')
     assert refused_by_vehicles(tmp_path) == {"wrong signature": 3}

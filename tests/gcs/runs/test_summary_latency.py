@@ -7,7 +7,7 @@ from gcs.runs.summary import summarise
 from tests.support.fleets.flown_run import DESIGN, line, ticks_of
 
 
-def test_each_estimate_has_status_and_samples_unknown_is_none() -> None:
+def test_estimates_have_status_and_samples_and_unknown_ones_are_none() -> None:
     scenario = line(2)
     ticks = ticks_of(scenario, start_s=0.0, count=200).ravel()
     ticks["commanded"] = True

@@ -1,4 +1,4 @@
-"""A vehicle that comes back has the time to come back before its error ends the flight."""
+"""A vehicle that returns to the formation gets the time to return before its error ends the flight."""
 
 from dataclasses import replace
 from math import hypot, nan
@@ -46,7 +46,7 @@ def test_a_vehicle_given_back_far_behind_returns_to_stable_flight(flavour: str) 
     assert flight.station.end_reason == "completed: duration reached"
     assert "is given back" in flight.texts("vehicle")
     limit_m = flight.station.plan.scenario.safety.spacing_error_limit_m
-    assert np.nanmax(flight.error_m(3)) > 1.5 * limit_m  # it was judged by nothing else
+    assert np.nanmax(flight.error_m(3)) > 1.5 * limit_m  # without time to return, this would have ended the flight
     assert flight.error_m(3)[-1] < 0.17
     assert verdict(flight.station.end_reason, 1.0) == "stable"
 
@@ -56,7 +56,7 @@ def test_vehicles_or_followers_not_back_in_time_end_the_flight() -> None:
     breakage, limit_m = Breakage(plan), plan.scenario.safety.spacing_error_limit_m
 
     def judged(time_s: float, errors_m: tuple[float, float], *, away: bool = False) -> str:
-        """With the errors of vehicles 2 and 3, of which vehicle 2 may be away."""
+        """The reason to end with these errors of vehicles 2 and 3, of which vehicle 2 may be away."""
         return breakage.judge(with_errors(nan, *errors_m), {1: False} if away else {}, APART, time_s)
 
     far_m = 2.0 * limit_m
@@ -71,7 +71,7 @@ def test_vehicles_or_followers_not_back_in_time_end_the_flight() -> None:
 
 
 def test_a_vehicle_that_keeps_failing_gets_no_new_time() -> None:
-    """Only one that has been back within the limit does, or one that its pilot flew."""
+    """New time is for a vehicle that was back within the limit, or that its pilot flew."""
     plan = plan_for(three())
     limit_m = plan.scenario.safety.spacing_error_limit_m
 
@@ -90,8 +90,8 @@ def test_a_vehicle_that_keeps_failing_gets_no_new_time() -> None:
     assert end_of(2.0 * limit_m, 2.0 * limit_m, piloted=True) == ""
 
 
-def test_the_time_suffices_the_slowest_gains_and_allows_for_limits() -> None:
-    """Against the loop itself: an error stays within the limit from then on."""
+def test_the_time_suffices_for_the_slowest_gains_and_for_limits() -> None:
+    """Checked with the loop itself: after that time, the error stays within the limit."""
     plan: FlightPlan = replace(plan_for(three()), scenario=three().model_copy(update={"limits": Limits()}))
     decay_1_s = slowest_decay_1_s(plan)
     model, K = plan.model, plan.gains[-1]

@@ -33,12 +33,12 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
 
 
 def with_headroom(headroom: float, gain_set: int = 0) -> float:
-    """The loop delay that has a headroom on a set."""
+    """The loop delay that leaves a headroom with a gain set."""
     return (1 - headroom) * MARGINS_S[gain_set]
 
 
 def after(state: VehicleState, *, seconds: float = 0.0, policy: Monitor = POLICY, **seen: Any) -> VehicleState:
-    """The state after the same observation at each tick (50 Hz) of a time; one tick if no time is given."""
+    """The state after the same observation at each tick (50 Hz) for `seconds`, by default for one tick."""
     for k in range(max(1, round(seconds * 50) + 1)):
         state = monitored(state, SEEN._replace(**seen, time_s=100.0 + 0.02 * k), MARGINS_S, policy)
     return state
@@ -109,7 +109,7 @@ def test_slower_gains_with_headroom_are_caution_until_the_link_returns() -> None
     state = after(NOMINAL, seconds=2.0, loop_delay_s=0.29)
     assert (state.mode, state.gain_set) == (Mode.CAUTION, 1)
     state = state._replace(changed_s=0.0)
-    # Against the faster margin of 0.3 s: wanted is a headroom of 0.35 for 3 s.
+    # Against the margin of the faster gains, 0.3 s, a headroom of 0.35 is required for 3 s.
     assert after(state, seconds=10.0, loop_delay_s=0.3 * 0.66).gain_set == 1
     assert after(state, seconds=2.9, loop_delay_s=0.3 * 0.64).gain_set == 1
     back = after(state, seconds=3.1, loop_delay_s=0.3 * 0.64)
@@ -139,7 +139,7 @@ def test_the_slowest_gains_release_a_vehicle_only_without_headroom() -> None:
     released = after(slowest, seconds=0.4, loop_delay_s=with_headroom(-0.05, 2))
     assert released.released
     assert released.mode is Mode.FAILSAFE
-    # It stays so while there is no headroom, though its failsafe shows, and comes back by way of FAILSAFE.
+    # It stays released until headroom suffices, though its failsafe shows, and comes back by way of FAILSAFE.
     still = after(released, seconds=10.0, loop_delay_s=with_headroom(0.3, 2), guided=False)
     assert still.released
     freed = after(released._replace(eased_s=inf), seconds=3.1, loop_delay_s=with_headroom(0.4, 2), guided=False)
@@ -147,7 +147,7 @@ def test_the_slowest_gains_release_a_vehicle_only_without_headroom() -> None:
     assert after(freed, guided=True).mode is Mode.RECOVERING
 
 
-def test_switched_off_the_modes_are_shown_and_nothing_is_done() -> None:
+def test_a_monitor_that_does_not_act_only_shows_modes() -> None:
     policy = POLICY.model_copy(update={"act": False})
     state = after(NOMINAL, seconds=20.0, policy=policy, loop_delay_s=with_headroom(-1.0))
     assert (state.mode, state.gain_set, state.released) == (Mode.CRITICAL, 0, False)

@@ -17,7 +17,7 @@ S = 1_000_000_000
 
 
 def two_vehicles() -> tuple[Links, RemoteVehicle]:
-    """The links of two vehicles, and the second of these."""
+    """The links of two vehicles, and the second vehicle."""
     links = new_links(2)
     return links, RemoteVehicle(7, startup=LaunchedStartup(50.0), links=links, row=1)
 

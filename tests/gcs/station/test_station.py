@@ -113,7 +113,7 @@ def test_a_heartbeat_of_zeros_disarms_like_any_other() -> None:
         ("base_mode", 128 | 64, False), ("system_status", 5, True), ("system_status", 3, False),
     ],
 )  # fmt: skip
-def test_a_heartbeat_tells_of_modes_kinds_arming_and_failsafe(name: str, value: int, matters: bool) -> None:
+def test_heartbeat_state_covers_mode_kind_arming_and_failsafe(name: str, value: int, matters: bool) -> None:
     fields = {"custom_mode": 4, "type": 2, "autopilot": 3, "base_mode": 129, "system_status": 4}
     one, other = (
         heartbeat_state(int.from_bytes(struct.pack("<IBBBB", *each.values()), "little"))
@@ -122,19 +122,19 @@ def test_a_heartbeat_tells_of_modes_kinds_arming_and_failsafe(name: str, value: 
     assert (one != other) == matters
 
 
-def test_reordered_or_repeated_frames_are_no_refusals_and_told_once() -> None:
+def test_reordered_or_repeated_frames_are_no_refusals_and_reported_once() -> None:
     station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
     for second in range(1, 5):
         for peer in peers:
             first, second_one, third = (peer.heartbeat(second * S) for _ in range(3))
             station.step([first, third, second_one, third], second * S)
     assert not station.counters
-    told = [(event.system_id, event.text) for event in station.events if event.kind == "link"]
+    reported = [(event.system_id, event.text) for event in station.events if event.kind == "link"]
     texts = "its frames arrive out of order", "its frames arrive more than once"
-    assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
+    assert reported == [(system_id, text) for system_id in (2, 3) for text in texts]
 
 
-def test_a_vehicle_that_counts_its_frames_anew_is_heard() -> None:
+def test_a_vehicle_that_restarts_its_sequence_numbers_is_heard() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
     peer.link.seq = 100
@@ -218,7 +218,7 @@ def test_a_vehicle_that_leaves_guided_is_reported_and_called_back(status: int, t
     assert commands(outgoing) == [(176, 0)]
 
 
-def test_ticks_that_were_slept_through_are_left_out_and_counted() -> None:
+def test_ticks_that_were_slept_through_are_skipped_but_numbered() -> None:
     station = Station(PLAN, start_ns=S)
     ticks = []
     for now_ns in (S, S + 20 * MS, S + 95 * MS, S + 100 * MS):
@@ -254,5 +254,5 @@ def test_texts_of_vehicles_cannot_move_the_cursor() -> None:
     texts = [b"\x1b[2J\x1b[31mred", b"one\nvehicle 2: LOST\r\x07", b"\xc2\x9b2J", "Höhe 5 m".encode()]
     said = [peer.datagram(peer.link.statustext_encode(2, text), S) for text in texts]
     station.step([peer.heartbeat(S), *said], S)
-    told = [event.text for event in station.events if event.kind == "statustext"]
-    assert told == ["�[2J�[31mred", "one�vehicle 2: LOST��", "�2J", "Höhe 5 m"]
+    shown = [event.text for event in station.events if event.kind == "statustext"]
+    assert shown == ["�[2J�[31mred", "one�vehicle 2: LOST��", "�2J", "Höhe 5 m"]

@@ -34,7 +34,7 @@ from tests.support.paths import ROOT
 
 
 class Here:
-    """Flies in this process and counts."""
+    """Flies trials in this process, notes which, and can be interrupted."""
 
     def __init__(self, *, stop_after: int = 10**9) -> None:
         self.flown: list[str] = []
@@ -53,7 +53,7 @@ def same(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return [replace(outcome, elapsed_s=0.0) for outcome in outcomes]
 
 
-def test_an_interrupted_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_an_interrupted_campaign_continues_where_it_stopped(tmp_path: Path) -> None:
     wanted = trials(5)
     first = Here(stop_after=2)
     store = trials_of(tmp_path)
@@ -169,7 +169,7 @@ if __name__ == "__main__":
 
 
 def running_in_group(group: int) -> list[int]:
-    """Processes of a group that still run; ended ones that nobody has asked after yet (zombies) do not."""
+    """Processes of a group that still run; those that have ended and were not waited for (zombies) do not count."""
     running: list[int] = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it ended meanwhile
@@ -189,10 +189,10 @@ def test_kill_9_loses_nothing_finished_and_leaves_no_workers(tmp_path: Path) -> 
     seen = [process.stdout.readline() for _ in range(3)]
     assert seen[0] == b"39\n"
     process.kill()
-    process.stdout.read()  # to its end: the workers, which hold the pipe too, have gone as well
+    process.stdout.read()  # until the pipe closes: the workers hold it open too, so they have ended
     process.stdout.close()
     process.wait()
-    while running_in_group(process.pid):  # multiprocessing's own tracker of semaphores has still to tidy up
+    while running_in_group(process.pid):  # multiprocessing's resource tracker still has to clean up
         pass
     store, fly, wanted = trials_of(tmp_path), Here(), trials(6)
     kept = set(store.flown)
@@ -217,7 +217,7 @@ def test_processes_and_a_dask_cluster_give_what_one_process_gives(tmp_path: Path
 
 
 def failing_line(outcome: Outcome) -> Outcome:
-    """Of a traceback only the last line: where a file lies is not part of the claim."""
+    """The outcome with only the last line of its traceback: the paths of files are not part of the claim."""
     error = outcome.error and outcome.error.strip().splitlines()[-1]
     return replace(outcome, elapsed_s=0.0, error=error)
 
@@ -233,7 +233,7 @@ class cluster:  # noqa: N801 - used as a function
         file = self.folder / "scheduler.json"
         place = ["--scheduler-file", str(file)]
         quiet = ["--no-dashboard", "--interface", "lo"]
-        free = ["--port", "0", "--dashboard-address", "127.0.0.1:0"]  # of its HTTP server, with no dashboard too
+        free = ["--port", "0", "--dashboard-address", "127.0.0.1:0"]  # the HTTP server runs without a dashboard too
         self._start("distributed.cli.dask_scheduler", *place, *quiet, *free)
         self._start(
             "distributed.cli.dask_worker", *place, *quiet, "--nthreads", "1", "--local-directory", str(self.folder)
@@ -249,11 +249,10 @@ class cluster:  # noqa: N801 - used as a function
 
     def _start(self, module: str, *arguments: str) -> None:
         command = [sys.executable, "-m", module, *arguments]
-        path = os.pathsep.join([str(ROOT)])
-        log = subprocess.DEVNULL
-        self.processes.append(subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": path}))
+        log, environment = subprocess.DEVNULL, os.environ | {"PYTHONPATH": str(ROOT)}
+        self.processes.append(subprocess.Popen(command, stdout=log, stderr=log, env=environment))
 
 
-def test_no_scheduler_is_one_line_with_what_was_wanted() -> None:
+def test_a_missing_scheduler_is_reported_in_one_line() -> None:
     with pytest.raises(InputError, match="wanted the address of a Dask scheduler"), dask_workers("no address"):
         pass

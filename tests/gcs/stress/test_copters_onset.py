@@ -24,7 +24,7 @@ MODELS: dict[str, dict[str, Any]] = {
 
 @cache
 def identified(model: str) -> FlightPlan:
-    """The leader and a follower of copters5 with its gains, as identified in flight."""
+    """The leader and one platoon of copters5 with its gains, as identified in flight."""
     scenario = three(**LIMITS, **MODELS[model]).with_calm_monitor()
     return identified_in_flight(plan_for(scenario))
 
@@ -36,7 +36,7 @@ def test_flown_onset_is_the_margin_of_the_identified_response(model: str) -> Non
     assert plan.responses is not None
     assert {found.model for found in plan.responses.of.values()} == {model}
     assert [found.lag_s for found in plan.responses.of.values()] == pytest.approx([MODELS[model]["lag_s"]] * 3, rel=0.1)
-    # the jerk limit makes the manoeuvre's lag up to 1.2 % too long, which is 4e-3 1/s and 0.7 % of the margin
+    # the jerk limit lengthens the identified lag by up to 1.2 %, which is 4e-3 1/s and 0.7 % of the margin
     assert onset_of(plan, within_1_s=6e-3) == pytest.approx(plan.delay_margin_s, rel=0.015)
 
 
@@ -47,8 +47,8 @@ def test_flown_onset_is_the_margin_of_the_given_response() -> None:
 
 
 def onset_of(plan: FlightPlan, *, within_1_s: float) -> float:
-    """The loop delay (s) at which the growth of small errors passes zero, between flights at 0.95 and 1.05 of the
-    computed margin, where it is `within_1_s` of the predicted."""
+    """The loop delay (s) at which the growth of small errors passes zero, from flights at 0.95 and 1.05 of the computed
+    margin. The growth in both must be within `within_1_s` of the predicted."""
     study, points = Study(plan), list[GrowthPoint]()
     for part in (0.95, 1.05):
         outcome = fly_trial(study.trial("probe", {"delay": part * plan.delay_margin_s - 0.01}, seed=9))

@@ -65,7 +65,7 @@ def modelled(loop: CoupledBlock, response: FreeResponse, before: FloatArray) -> 
     [{"delay": 0.15, "jitter": 0.03}, {"delay": 0.15, "loss": 0.4}, {"delay": 0.25, "jitter": 0.01, "loss": 0.2}],
 )
 def test_a_loop_on_random_links_follows_its_linear_model(coordinates: dict[str, float]) -> None:
-    """Two independent ways, to the last digits of telemetry, though the links push the vehicles by metres."""
+    """Two independent ways agree to the last digits of telemetry, though the links push the vehicles by metres."""
     plan = plan_with(**coordinates)
     [_, follower] = plan_loops(plan)
     calm = fly_calm(plan, None)
@@ -88,7 +88,7 @@ class Reported:
         self.velocity_m_s: list[float] = []
 
     def at(self, time_s: float, newest_s: float) -> tuple[float, float]:
-        """Between two reports their cubic, and a line for the velocity; after the newest one straight on."""
+        """Between two reports a cubic for position and a line for velocity; after the newest, constant velocity."""
         k = int(np.searchsorted(self.time_s, newest_s - 1e-9))
         if time_s >= newest_s:
             return self.position_m[k] + self.velocity_m_s[k] * (time_s - newest_s), self.velocity_m_s[k]
@@ -99,10 +99,10 @@ class Reported:
 
 
 def test_a_coupled_loop_on_unequal_links_follows_its_linear_model() -> None:
-    """The leader uses the follower's spacing, which it hears 60 ms later than itself: the station carries it forward.
+    """The leader uses the follower's spacing, which arrives 60 ms later than its own: the station extrapolates it.
 
-    In absolute positions along one axis, from the instants at which states were sampled and commands acted. A model of
-    one delay for each vehicle's command, which has all states at the instant of the vehicle's own, is not as near.
+    The model has absolute positions along one axis, and the instants at which states were sampled and commands acted. A
+    model with one delay per command, which takes all states at the instant of the vehicle's own, is less exact.
     """
     plan = pair_plan()
     gain = plan.gain.copy()
@@ -147,7 +147,7 @@ def test_a_coupled_loop_on_unequal_links_follows_its_linear_model() -> None:
         off.append(what["velocity_error_north_m_s"] - (v1, v2)[system_id - 1])
         if system_id == 2:
             off.append(what["spacing_error_north_m"] - (p1 - p2))
-    assert np.abs(off).max() < 1e-3  # 0.06 m if nothing were carried forward
+    assert np.abs(off).max() < 1e-3  # 0.06 m without extrapolation
     assert np.abs(rows["velocity_error_north_m_s"]).max() > 1.0
 
 
@@ -163,7 +163,7 @@ def test_losing_every_second_command_adds_half_a_period() -> None:
     assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
 
 
-def test_no_commands_have_no_delay() -> None:
+def test_without_commands_the_effective_delay_is_zero() -> None:
     assert effective_delay_s(np.empty((0, 2), dtype=np.int64), held_s=PERIOD_S) == 0.0
 
 
@@ -182,7 +182,7 @@ def test_a_probe_measures_the_loop_whatever_limits_the_vehicles_have(coordinates
 
 
 def test_the_effective_delay_predicts_loss_the_median_does_not() -> None:
-    """A third of the datagrams lost each way: the median of the loop delays knows nothing of commands that never came.
+    """A third of the datagrams is lost each way. The median of the loop delays ignores commands that never arrived.
 
     The effective delay is right to first order in the variation, here to 0.05 1/s; the median is off by 0.2.
     """

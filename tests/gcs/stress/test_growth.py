@@ -42,7 +42,7 @@ def test_the_slower_mode_is_reported_though_it_starts_smaller() -> None:
 
 
 def test_the_slowest_mode_counts_where_it_stands_out_from_noise() -> None:
-    """As of a predicted loop near 0.72 s: it carries less than a tenth of the motion, and many times the noise."""
+    """As in predicted loops near 0.72 s, it carries less than a tenth of the motion, yet many times the noise."""
     slowest, other = (-0.362 + 9.8j, 0.065), (-0.455 + 2.24j, 0.72)
     for noise, (mode, _), allowed in ((1e-4, slowest, 1e-3), (0.03, other, 0.03)):  # the rates are 0.09 1/s apart
         found = fit_growth(motion(slowest, other, noise=noise), start_s=0.0, end_s=9.5)
@@ -58,7 +58,7 @@ def test_a_real_mode_is_found_beside_an_oscillation() -> None:
 
 
 def test_a_fast_growth_is_found_beside_an_error_that_stays() -> None:
-    """As of a loop that feeds back velocities alone: the error of position outweighs the growth until the end."""
+    """As in a loop that feeds back velocities alone: the position error outweighs the growth until the end."""
     found = fit_growth(motion((14.3, 2e-5), (1e-9, 1.0), seconds=0.9, noise=1e-6), start_s=0.0)
     assert found is not None
     assert found.growth_1_s == pytest.approx(14.3, abs=1e-3)
@@ -78,7 +78,7 @@ def test_the_error_says_how_far_noise_has_moved_the_rate() -> None:
 
 
 def test_noise_after_the_motion_is_not_a_mode() -> None:
-    """Rounding of the telemetry stays when a fast motion is gone: 1e-4 of it, here for nine tenths of the time."""
+    """Rounding of the telemetry remains after a fast motion is gone: 1e-4 of it, here for nine tenths of the time."""
     found = fit_growth(motion((-3.0 + 4j, 1.0), noise=1e-4), start_s=0.0)
     assert found is not None
     assert found.growth_1_s == pytest.approx(-3.0, abs=0.01)
@@ -114,13 +114,13 @@ def test_growth_through_varying_delays_is_the_mean_rate(
         errors.append(found.error_1_s)
         frequencies.append(found.frequency_rad_s)
     assert np.median(frequencies) == pytest.approx(3.7, rel=0.01)
-    assert frequencies == pytest.approx([3.7] * 60, rel=0.1)  # ten seconds: six turns, of which the wander takes part
+    assert frequencies == pytest.approx([3.7] * 60, rel=0.1)  # ten seconds are six turns; the wander shifts them
     spread = float(np.std(off))
     assert abs(np.mean(off)) < 3.0 * spread / np.sqrt(60.0)
     assert spread / 2.0 < np.sqrt(np.mean(np.square(errors))) < 2.0 * spread
 
 
-def test_a_motion_that_turns_no_sign_has_no_frequency() -> None:
+def test_a_motion_that_never_changes_sign_has_no_frequency() -> None:
     for found in (
         norm_growth(motion((-0.3, 1.0)), start_s=0.0),
         envelope_growth(np.exp(-0.1 * np.arange(80.0)), period_s=0.25, start_s=0.0),
@@ -151,7 +151,7 @@ def test_a_state_that_two_ticks_used_counts_once() -> None:
     assert np.array_equal(once.values, twice.values)
 
 
-def test_irregular_samples_are_brought_to_equal_distances() -> None:
+def test_irregular_samples_are_resampled_at_equal_intervals() -> None:
     """Telemetry with gaps and samples up to 9 ms off: the rate is that of the motion, not of the sampling."""
     rng = np.random.default_rng(3)
     boot_ms = np.unique(np.arange(1000) * 20 + rng.integers(-9, 10, 1000) + 100)
@@ -186,7 +186,7 @@ def curve(delay_s: float) -> float:
     ("half_width_s", "allowed_s"),
     [(0.03, 1e-9), (0.1, 1e-9)],  # the parabola is exact here
 )
-def test_zero_of_a_bent_curve(half_width_s: float, allowed_s: float) -> None:
+def test_the_zero_of_a_bent_curve_is_found(half_width_s: float, allowed_s: float) -> None:
     delays = 0.305 + half_width_s * np.linspace(-1.0, 1.0, 5)
     zero = locate_zero([GrowthPoint(float(d), curve(float(d)), 1e-5) for d in delays])
     assert zero is not None
@@ -208,7 +208,7 @@ def test_the_zeros_error_is_the_rates_error_over_the_slope() -> None:
 
 
 def test_flights_over_a_kink_show_a_misfit_and_larger_error() -> None:
-    """As the sampled loop has at whole numbers of periods: slopes of 18 and 14 1/s², seen of a graph-dk design."""
+    """The sampled loop has such kinks at whole numbers of periods; a graph-dk design had slopes of 18 and 14 1/s²."""
     for half_width_s, smooth in ((0.004, False), (0.0002, False), (0.004, True)):
         delays = 0.2 + half_width_s * np.linspace(-1.0, 0.8, 5)
         rates = [(18.0 if d < 0.2 and not smooth else 14.0) * (float(d) - 0.2) for d in delays]

@@ -1,4 +1,4 @@
-"""What an onset says that is not known well, or that no link delay reaches; and a sweep that measures nothing."""
+"""Onsets that are not known well or that no link delay reaches, and sweeps that measure nothing."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -105,7 +105,7 @@ def test_a_probe_that_grows_before_the_onset_contradicts_it(
     ],
 )
 def test_an_onset_that_waiting_exceeds_is_not_a_link_delay(waiting_s: float, spread_s: float, said: str) -> None:
-    """Flights whose growth is zero at 0.27 s, and that wait longer than that: always, or in the mean."""
+    """Flights whose growth is zero at 0.27 s, and that wait longer than that, always or on average."""
     with pytest.raises(NoOnset, match=said):
         search_among_waits(waiting_s, spread_s, block_s=0.27)
 
@@ -144,9 +144,9 @@ def test_a_sweep_that_only_aborts_fails_and_says_why() -> None:
     sweep = [aborted(STUDY.trial(kind, {"delay": 0.0}, seed=7)) for kind in ("probe", "own")]
     assert [own.verdict for own in sweep] == ["aborted", "aborted"]
     assert [(own.loop_delay_s, own.waiting_s, own.predicted_growth_1_s) for own in sweep] == [(None, None, None)] * 2
-    told = result(None, sweep=sweep, allowed=None)
-    assert not told.passed
-    assert told.failure == f"nothing was measured: all 2 trials were aborted, the first: {sweep[0].reason}"
+    found = result(None, sweep=sweep, allowed=None)
+    assert not found.passed
+    assert found.failure == f"nothing was measured: all 2 trials were aborted, the first: {sweep[0].reason}"
     assert result(None, sweep=[replace(sweep[0], verdict="stable"), sweep[1]], allowed=None).passed
 
 

@@ -40,7 +40,7 @@ blocks = [
 
 
 def with_links(scenario: Scenario, **delays_s: float) -> Scenario:
-    """The scenario over constant links: each way `delay_s`, and another one for vehicles named `v2=` and so on."""
+    """The scenario over constant links with a delay each way of `all`, or of `v2` for vehicle 2, and so on."""
     vehicles = tuple(
         VehicleLinks(system_id=int(name[1:]), up=Link(delay_s=own_s), down=Link(delay_s=own_s))
         for name, own_s in delays_s.items()
@@ -65,7 +65,7 @@ def test_a_link_alone_breaks_its_loop_at_the_loops_margin() -> None:
     [leader, follower] = plan_loops(study_of(SCENARIO).plan)
     assert onset.predicted_s == pytest.approx(follower.margin_s())
     assert follower.margin_s() < 0.9 * leader.margin_s()
-    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # 3e-5
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # measured: 3e-5
     assert onset.link_delay_left_s == pytest.approx(onset.link_delay_s - 0.12)
     assert (onset.vehicle, onset.critical, onset.loop) == (2, 2, (2,))
 
@@ -76,8 +76,8 @@ def test_a_loop_with_unlike_links_breaks_where_its_model_does() -> None:
     onset = onset_of(scenario, 2)
     assert onset.predicted_s is not None
     assert onset.loop == (1, 2, 3)
-    assert onset.loop_delay_s > 1.3 * study_of(scenario).plan.delay_margin_s  # alone, a link may be slower than all
-    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=5e-4)  # 1e-4
+    assert onset.loop_delay_s > 1.3 * study_of(scenario).plan.delay_margin_s  # a single link may exceed the margin
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=5e-4)  # measured: 1e-4
     assert onset.checks == ()  # there is no other loop
     assert [own.verdict for own in onset.own] == ["stable", "unstable"]  # both past the margin of equal links
 
@@ -107,7 +107,7 @@ def test_links_that_break_another_loop_leave_no_onset_to_find() -> None:
         (["--onset-of", "2", "--loop", "onboard"], "read 2 with loops on board, wanted a vehicle that shares"),
     ],
 )
-def test_onsets_of_no_single_link_are_refused(options: list[str], wanted: str) -> None:
+def test_options_without_an_onset_of_one_link_are_refused(options: list[str], wanted: str) -> None:
     result = CliRunner().invoke(app, ["stress", "chain3_bidirectional", *options])
     assert isinstance(result.exception, InputError)
     assert wanted in str(result.exception)
@@ -162,7 +162,7 @@ def test_a_shared_loop_may_break_far_below_its_margin() -> None:
     assert found.headroom < -0.5
     assert follower.expected_loop_delay_s + (follower.link_delay_left_s or 0.0) == pytest.approx(0.3635, abs=4e-3)
     onset = onset_of(scenario, 2)  # from a link that is past it
-    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # 4e-5
+    assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # measured: 4e-5
     assert onset.link_delay_left_s is not None
     assert onset.link_delay_left_s < -0.2
     alike = flight_plan(with_links(scenario, all=0.1))

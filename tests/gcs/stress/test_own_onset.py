@@ -1,4 +1,4 @@
-"""Onsets of laws and dynamics of one's own, found without a margin to start from."""
+"""Onsets of a user's own laws and dynamics, found without a margin to start from."""
 
 from collections.abc import Callable, Sequence
 
@@ -32,7 +32,7 @@ def test_a_saturating_law_breaks_where_its_linear_part_does() -> None:
     assert onset.predicted_s is onset.difference is onset.predicted_continuous_s is None
 
 
-def test_a_lag_of_ones_own_breaks_where_the_response_says() -> None:
+def test_own_dynamics_with_a_lag_break_where_the_response_says() -> None:
     onset = onset_of(coded(dynamics="lagged", response=Response(lag_s=0.1)))
     assert onset.difference == pytest.approx(0.0, abs=0.01)
     assert onset.predicted_s == flight_plan(coded(dynamics="lagged", response=Response(lag_s=0.1)))[0].delay_margin_s
@@ -48,7 +48,7 @@ def test_a_lag_of_ones_own_breaks_where_the_response_says() -> None:
         (always(None), "the margin is unknown, and no growth rate could be measured at 0 s of link delay"),
     ],
 )
-def test_flights_tell_between_which_delays_growth_begins(
+def test_flights_find_between_which_delays_growth_begins(
     growth_1_s: Callable[[float], float | None], wanted: tuple[float, float] | str
 ) -> None:
     study, flown = Study(flight_plan(coded(law="soft"))[1]), list[float]()

@@ -1,4 +1,4 @@
-"""The search for the two onsets of a loop that is predicted over a fixed delay, among flights that grow as predicted.
+"""The search for both onsets of a loop with prediction over a fixed delay, among flights that grow as modelled.
 
 `tests/flights/loops/test_predicted_flight.py` flies at both ends of a window.
 """
@@ -58,7 +58,7 @@ def test_the_search_ends_at_either_end_of_the_window(study: Study, *, shorter: b
     assert curve_error(onset.flights) == pytest.approx(0.0)
 
 
-def test_an_onset_stays_where_no_link_delay_is_too_short(study: Study) -> None:
+def test_upper_onset_stays_if_no_link_delay_is_too_short(study: Study) -> None:
     onset = search(study, shorter=False)
     control = Control.model_validate({"delay_margin_s": 0.3, "prediction": 0.55})
     slow = load(SCENARIOS / "chain3.toml").model_copy(
@@ -67,7 +67,7 @@ def test_an_onset_stays_where_no_link_delay_is_too_short(study: Study) -> None:
     design, plan = flight_plan(slow.with_calm_monitor())
     with pytest.raises(NoOnset, match="no link delay is short enough to break the formation: errors decay in") as why:
         search(Study(plan), shorter=True, waiting_s=0.2)  # the window begins at 0.08 s
-    told = result_of(study, design, [], axes=[], sweep=[], onset=onset, onset_shorter=why.value, allowed=0.05)
-    assert told.passed
-    assert told.onset is onset
-    assert told.onset_shorter_missing == str(why.value)
+    found = result_of(study, design, [], axes=[], sweep=[], onset=onset, onset_shorter=why.value, allowed=0.05)
+    assert found.passed
+    assert found.onset is onset
+    assert found.onset_shorter_missing == str(why.value)

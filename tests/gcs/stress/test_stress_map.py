@@ -57,9 +57,9 @@ def test_predicted_flights_on_the_guaranteed_line_are_stable() -> None:
     assert line is not None
     top = int(line[:, 1].argmax())
     assert line[top, 1] > 0.015
-    # it falls to either side of the delay at which nothing is off: the assumed one less half a period of waiting
+    # it falls on either side of the delay without mismatch: the assumed one less half a period of waiting
     assert line[top, 0] == pytest.approx(0.29, abs=0.01)
-    halving_s = 1e-5  # what is left of the interval that is halved
+    halving_s = 1e-5  # what is left of the bisected interval
     assert (np.diff(line[: top + 1, 1]) >= -halving_s).all()
     assert (np.diff(line[top:, 1]) <= halving_s).all()
     for delay_s, jitter_s in (line[0], line[top], line[-1]):
@@ -118,7 +118,7 @@ def test_maps_with_and_without_prediction_are_drawn_side_by_side(tmp_path: Path)
 
 
 def test_two_loops_of_a_tree_break_along_a_rectangle() -> None:
-    """The sides are the sampled margins less the waiting, as near as half a period for the hold is."""
+    """The sides are the sampled margins less the waiting, as exactly as the hold counts as half a period."""
     study = Study(pair_plan())
     axes = (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5)))
     near = [

@@ -42,7 +42,7 @@ def run(folder: Path, *options: str, code: int = 0, **changes: Any) -> str:
 
 
 def junit_counts(file: Path) -> dict[str, int]:
-    """The counts that a report claims; it has to be valid by the schema, and its cases have to be as many."""
+    """The counts that a report claims; it must be valid by the schema, and have as many cases of each kind."""
     schema = etree.XMLSchema(etree.parse(str(DATA / "junit.xsd")))
     schema.assertValid(etree.parse(str(file)))
     suite = ElementTree.parse(file).getroot()
@@ -70,7 +70,7 @@ def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     for name in ("stress.json", "trials.parquet", "growth.png", "worst.png", "scenario.toml"):
         assert (out / name).stat().st_size > 0
     assert junit_counts(junit) == {"tests": 1, "failures": 0, "errors": 0, "skipped": 0}
-    # taken up again it flies nothing, and says the same
+    # resumed, it flies nothing and reports the same
     lines = (out / TRIALS_FILE).read_bytes()
     again = json.loads(run(tmp_path, *options, "--json", "--resume"))
     assert (out / TRIALS_FILE).read_bytes() == lines
@@ -83,7 +83,7 @@ def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     assert (out / "stress.json").read_bytes() == before
 
 
-def test_a_campaign_is_taken_up_with_its_own_scenario_only(tmp_path: Path) -> None:
+def test_a_campaign_is_resumed_with_its_own_scenario_only(tmp_path: Path) -> None:
     out, run_folder = tmp_path / "out", tmp_path / "run"
     run(tmp_path, "--delay", "0", "--out", str(out))
     before = {file.name: file.read_bytes() for file in out.iterdir()}
@@ -112,14 +112,14 @@ def found_with(plan: FlightPlan, folder: Path) -> Onset:
 
 
 def test_a_margin_that_the_gains_lack_is_exposed(tmp_path: Path) -> None:
-    """The gains flown are 1.25 times those that the margin was computed for: it breaks sooner, and is found there."""
+    """The gains flown are 1.25 times those of the margin: the loop breaks sooner, and the onset is found there."""
     plan = pair_plan()
-    onset = found_with(replace(plan, gain=1.25 * plan.gain), tmp_path)
+    flown = replace(plan, gain=1.25 * plan.gain)
+    onset = found_with(flown, tmp_path)
     assert onset.predicted_s == plan.delay_margin_s
     assert onset.difference is not None
     assert onset.difference < -0.1
-    true_s = Study(replace(plan, gain=1.25 * plan.gain))
-    assert onset.loop_delay_s == pytest.approx(margin_of(true_s.plan), rel=5e-4)
+    assert onset.loop_delay_s == pytest.approx(margin_of(flown), rel=5e-4)
 
 
 def margin_of(plan: FlightPlan) -> float:
@@ -128,7 +128,7 @@ def margin_of(plan: FlightPlan) -> float:
 
 
 def test_assert_onset_fails_where_the_margin_does_not_hold(tmp_path: Path) -> None:
-    """Telemetry rounds positions to float32: no flight agrees with the margin to one part in ten thousand million."""
+    """Telemetry rounds positions to float32: no flight agrees with the margin to one part in ten billion."""
     out, junit = tmp_path / "out", tmp_path / "junit.xml"
     options = ["--assert-onset", "1e-10", "--junit", str(junit), "--out", str(out)]
     output = run(tmp_path, *options, code=1)
@@ -151,8 +151,8 @@ def test_a_map_flies_probes_and_own_trials_per_seed(tmp_path: Path) -> None:
     assert (out / "map.png").stat().st_size > 0
 
 
-def printed_replay(output: str) -> list[str]:
-    """The arguments of the command that flies the worst trial again, as it is printed."""
+def printed_refly(output: str) -> list[str]:
+    """The arguments of the printed command that reflies the worst trial."""
     [line] = [line for line in output.splitlines() if line.startswith("again")]
     return line.split()[3:]
 
@@ -161,7 +161,7 @@ def test_the_printed_command_reflies_a_trial_to_the_last_bit(tmp_path: Path) -> 
     """At 0.5 s of link delay and with jitter: the tick log's hash is part of what is compared."""
     out = tmp_path / "out"
     output = run(tmp_path, "--delay", "0.1,0.5", "--jitter", "0.01", "--out", str(out))
-    scenario, *options = printed_replay(output)
+    scenario, *options = printed_refly(output)
     result = CliRunner().invoke(app, [scenario, *options])
     assert result.exit_code == 0, result.output
     assert re.search(r"^verdict  unstable: (not settled in|broken: )", result.output, re.MULTILINE)
@@ -173,7 +173,7 @@ def test_the_printed_command_reflies_a_trial_to_the_last_bit(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("loss", ["0", "0.1"])
-def test_a_reflown_trial_is_told_as_a_flight(loss: str, tmp_path: Path) -> None:
+def test_a_reflown_trial_is_reported_as_a_flight(loss: str, tmp_path: Path) -> None:
     """At 0.32 s of loop delay errors grow by a few percent a second: the flight is completed, and unstable."""
     out = tmp_path / "out"
     output = run(tmp_path, "--delay", "0.31", "--loss", loss, "--out", str(out), duration_s=6.0)
@@ -183,9 +183,9 @@ def test_a_reflown_trial_is_told_as_a_flight(loss: str, tmp_path: Path) -> None:
     with closing(trials_of(out)) as store:
         trials = list(store.flown.values())
     for trial in trials:
-        told = run(tmp_path, "--trial", trial.id, "--out", str(out), duration_s=6.0)
-        assert f", delay 0.31 s, loss {loss}\n" in told
-        [verdict] = [line for line in told.splitlines() if line.startswith("verdict")]
+        printed = run(tmp_path, "--trial", trial.id, "--out", str(out), duration_s=6.0)
+        assert f", delay 0.31 s, loss {loss}\n" in printed
+        [verdict] = [line for line in printed.splitlines() if line.startswith("verdict")]
         if trial.verdict == "unstable":
             assert f"final spacing error {trial.spacing_error_final_m:.2f} m, largest" in verdict or "broken" in verdict
 
@@ -248,7 +248,7 @@ def test_a_real_time_trial_records_the_machines_noise(tmp_path: Path) -> None:
         (["--onset", "--dask", "no address"], "wanted the address of a Dask scheduler"),
     ],
 )
-def test_input_that_cannot_be_used_is_told_and_leaves_nothing(tmp_path: Path, options: list[str], wanted: str) -> None:
+def test_unusable_input_is_refused_and_leaves_nothing(tmp_path: Path, options: list[str], wanted: str) -> None:
     (tmp_path / "pair.toml").write_text(dump(SCENARIO), encoding="utf-8")
     result = CliRunner().invoke(app, [str(tmp_path / "pair.toml"), *options])
     assert isinstance(result.exception, InputError)

@@ -55,8 +55,8 @@ def test_flown_growth_is_that_of_the_sampled_model(name: str, delay_s: float) ->
 @pytest.mark.parametrize(
     "own",
     [
-        ((7.6, 0.3, -4.7, 0.0), (-0.2, 6.1, 0.0, -4.7)),  # the fit wants four modes and as many of what is late
-        ((6.5, 1.2, -4.0, -0.7), (1.2, 6.5, -0.7, -4.0)),  # the slow mode is along one diagonal, and has to be moved
+        ((7.6, 0.3, -4.7, 0.0), (-0.2, 6.1, 0.0, -4.7)),  # the fit needs a mode for each state and delayed state
+        ((6.5, 1.2, -4.0, -0.7), (1.2, 6.5, -0.7, -4.0)),  # the slow mode is along one diagonal, and has to be excited
     ],
 )
 def test_a_follower_with_coupled_axes_is_measured(
@@ -81,7 +81,7 @@ def test_growth_with_slower_telemetry_matches_the_effective_delay(telemetry_hz: 
 
 
 def test_the_leaders_loop_can_be_probed_too() -> None:
-    """Its margin is larger, so it decays where the followers are at their edge."""
+    """Its margin is larger, so it decays where the followers are near theirs."""
     outcome = fly_trial(study_of("chain3").trial("probe", {"delay": 0.285}, seed=4, probe=1))
     assert (outcome.probed, outcome.critical) == (1, 1)
     assert outcome.growth_1_s == pytest.approx(-0.94, abs=0.05)
@@ -121,7 +121,7 @@ def test_moving_delay_between_links_keeps_waiting_and_loop_delay(up_ms: int, dow
     waits_s = -up.delay_s % period_s  # of telemetry that is sampled at whole periods
     loop_delay_s = up.delay_s + waits_s + down.delay_s
     off_s = abs(loop_delay_s - (up_ms + down_ms) * 1e-3 - waiting_s)
-    # rounding can put the arrival on either side of a tick; too short a link cannot go below nothing
+    # rounding can put the arrival on either side of a tick; a link delay cannot go below zero
     assert min(off_s, abs(off_s - period_s)) < 1e-9 or down.delay_s == 0.0
 
 
@@ -141,14 +141,14 @@ def test_the_same_trial_has_the_same_outcome() -> None:
     assert first == second
 
 
-def test_fast_growth_is_measured_with_a_smaller_error() -> None:
+def test_fast_growth_is_measured_from_a_smaller_initial_error() -> None:
     outcome = fly_trial(pair_trial(0.5))
     assert outcome.amplitude_m is not None
     assert outcome.amplitude_m < 1.0
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=1e-3)
 
 
-def test_a_trial_that_raises_says_where_and_does_not_raise() -> None:
+def test_a_failing_trial_records_its_exception_and_does_not_raise() -> None:
     outcome = fly_trial(pair_trial(gain=((99, 0, 1.0),)))
     assert outcome.error is not None
     assert "IndexError" in outcome.error
@@ -156,7 +156,7 @@ def test_a_trial_that_raises_says_where_and_does_not_raise() -> None:
     assert outcome.growth_1_s is None
 
 
-def test_the_monitor_only_watches() -> None:
+def test_the_monitor_does_not_act_in_a_trial() -> None:
     """Far above the margin it would release the vehicles; here the flight goes on until it breaks."""
     acting = SCENARIO.model_copy(update={"monitor": SCENARIO.monitor.model_copy(update={"act": True})})
     trial = replace(pair_trial(0.6), scenario=at_coordinates(acting, {"delay": 0.6}), kind="own")

@@ -46,7 +46,7 @@ def test_the_largest_formation_holds_and_the_next_does_not(short: Scenario) -> N
     assert fly_loaded(short, 20.0, found.most.vehicles) == found.most
 
 
-def test_a_formation_counts_with_its_worst_losses(short: Scenario) -> None:
+def test_a_formation_is_judged_by_its_worst_losses(short: Scenario) -> None:
     alone = [fly_loaded(short.model_copy(update={"seed": short.seed + k}), 10.0, 3) for k in range(3)]
     assert all(load.holds for load in alone)
     assert len({load.lost_down for load in alone}) == 3
@@ -80,7 +80,7 @@ def test_json_holds_what_is_shown() -> None:
     assert found["next"] is None
 
 
-def test_a_study_says_at_first_how_many_flights_it_has() -> None:
+def test_a_study_first_says_how_many_flights_it_has() -> None:
     result = CliRunner().invoke(app, ["capacity", str(RADIO), "--rates", "10", "--most", "2", "--seeds", "1"])
     assert result.exit_code == 0, result.output
     assert result.stderr == "flights  at most 2 formations, one flight of 180 s each\n"

@@ -27,7 +27,7 @@ def test_loop_on_board_flies_at_rates_not_dividing_its_sensors(short: Scenario) 
     assert found.loop_delay_p50_s is not None
 
 
-def test_early_end_is_told_as_the_station_told_it(short: Scenario) -> None:
+def test_an_early_end_is_reported_in_the_stations_words(short: Scenario) -> None:
     safety = short.safety.model_copy(update={"spacing_error_limit_m": 1.0})  # every second vehicle begins 2 m off
     found = fly_loaded(short.model_copy(update={"safety": safety}), 10.0, 2)
     assert found.reason.startswith("not formed: vehicle 2 is 2 m from its place")

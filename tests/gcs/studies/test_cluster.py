@@ -10,8 +10,8 @@ from tests.support.paths import SCENARIOS
 
 def test_one_worker_or_all_fly_a_map_beside_another_cluster() -> None:
     with socket.socket() as taken:
-        with contextlib.suppress(OSError):  # by another cluster indeed
-            taken.bind(("127.0.0.1", 8787))  # Dask's usual port, which warns if it cannot have it
+        with contextlib.suppress(OSError):  # another cluster already has it
+            taken.bind(("127.0.0.1", 8787))  # Dask's default port; Dask warns if it is taken
         found = map_on_cluster(load(SCENARIOS / "chain3.toml"), trials=4, workers=2, seconds=0.5)
     assert (found.trials, found.workers) == (4, 2)
     assert min(found.to_dict().values()) > 0.0

@@ -31,7 +31,7 @@ PACKAGES = {"MAVSDK": "mavsdk", "JSBSim": "jsbsim", "python-control": "control",
 
 @pytest.fixture
 def lean(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None of the packages that are not always there is installed."""
+    """None of the optional packages is installed."""
     for package in PACKAGES.values():
         monkeypatch.setitem(sys.modules, package, None)
 

@@ -85,7 +85,7 @@ def test_no_choice_of_late_gains_gives_the_published_margin() -> None:
     nearest = int(np.argmin(np.abs(margins - 0.19)))
     assert margins[nearest] == pytest.approx(0.093206, abs=1e-6)
     assert errata.subset_margin_by_sweep(nearest) == pytest.approx(margins[nearest], rel=1e-6)
-    # all of them late; the entries of up to 0.0053 that couple the axes take 1e-5 s
+    # all of them late; the entries of up to 0.0053 that couple the axes take away 1e-5 s
     assert margins[-1] == pytest.approx(0.077736, abs=2e-5)
 
 

@@ -76,7 +76,7 @@ def test_identified_responses_are_in_the_design() -> None:
     assert [vehicle.lag_s for vehicle in flight.design.response.vehicles] == pytest.approx(5 * [0.15], abs=1e-6)
 
 
-def test_what_the_command_refuses_is_refused() -> None:
+def test_python_refuses_what_the_command_refuses() -> None:
     with pytest.raises(ScenarioError, match="read no such file, wanted a scenario file"):
         gcs.fly_virtual("nonsense")
     scenario = load(SCENARIOS / "chain3.toml")

@@ -1,4 +1,4 @@
-"""report.html of a flight, and the charts in it; every page is as wide as its window, also on a phone."""
+"""report.html of a flight and its charts; the page is no wider than its window, even on a phone."""
 
 import re
 import subprocess
@@ -19,7 +19,7 @@ CHROMIUM = which("chromium") or which("chromium-browser") or which("google-chrom
 
 
 def report(folder: Path, vehicles: int) -> str:
-    """The page of a run of five seconds, at whose middle the first vehicle is CRITICAL for a second."""
+    """The page of a run of five seconds, in the middle of which the first vehicle is CRITICAL for a second."""
     scenario = line(vehicles)
     ticks = ticks_of(scenario, start_s=-0.2, count=260)
     ticks["commanded"] = ticks["time_s"] >= 0.0
@@ -52,7 +52,7 @@ def test_modes_are_of_vehicles_that_left_nominal_in_flight(tmp_path: Path) -> No
     assert re.findall(r"</i>(\w+)</span>", modes) == ["NOMINAL", "CRITICAL", "WAITING"]
 
 
-def test_what_vehicles_do_at_once_is_one_row(tmp_path: Path) -> None:
+def test_simultaneous_events_of_vehicles_share_a_row(tmp_path: Path) -> None:
     report(tmp_path, 3)
     turned = [Event(time_s=0.02, kind="mode", system_id=k, text="WAITING -> NOMINAL") for k in (1, 2, 3)]
     ended = Event(time_s=5.0, kind="end", text="completed")
@@ -62,7 +62,7 @@ def test_what_vehicles_do_at_once_is_one_row(tmp_path: Path) -> None:
     assert rows == [("0.02", "1 2 3"), ("5.00", "")]
 
 
-def test_report_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
+def test_report_loads_nothing_from_elsewhere(tmp_path: Path) -> None:
     page = report(tmp_path, 3).replace("http://www.w3.org/2000/svg", "")
     assert not re.search(r"https?:|src=|<script|<link|@import", page)
 

@@ -1,4 +1,4 @@
-"""The wanted places that the recording draws, of a formation that manoeuvres."""
+"""The wanted places that the recording draws for a manoeuvring formation."""
 
 import numpy as np
 import pytest

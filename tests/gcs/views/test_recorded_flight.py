@@ -58,7 +58,7 @@ def rerun(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run([program, *arguments], capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_reruns_own_check_finds_the_recording_whole(run: Path) -> None:
+def test_reruns_own_check_finds_the_recording_valid(run: Path) -> None:
     assert rerun("rrd", "verify", run / "flight.rrd").returncode == 0
     cut = run / "cut.rrd"
     cut.write_bytes(b"RRF2" + bytes(200))

@@ -100,7 +100,7 @@ def test_events_before_the_flight_stand_at_the_recordings_start(tmp_path: Path) 
     events = [chunk.to_record_batch() for chunk in RrdReader(file).stream().filter(content="/events")]
     texts = [text for batch in events for [text] in batch.column("TextLog:text").to_pylist()]
     assert [text.split() for text in texts] == [
-        ["start", "+19.00", "s", "phase", "connecting"],  # 1 s before the 20 s after which it is given up
+        ["start", "+19.00", "s", "phase", "connecting"],  # 1 s before start-up is given up, which is after 20 s
         ["0.98", "s", "end", "duration", "reached"],
     ]
 

@@ -8,7 +8,7 @@ from scenarios.schema import Control, FixedGains, Rates
 from scenarios.shipped import located
 
 
-def test_settled_flight_says_how_long_vehicles_were_out_of_hand() -> None:
+def test_a_settled_flight_says_how_long_vehicles_left_nominal() -> None:
     """The last vehicle is silent for 4 s, after which it is in failsafe for a tick or two."""
     calm = Link(delay_s=0.02)
     silent = calm.model_copy(update={"outages": (Outage(from_s=10.0, until_s=14.0),)})
@@ -29,13 +29,13 @@ def test_margins_of_single_vehicles_are_not_mistaken_for_slower_gains() -> None:
     assert "; margin 390.0 to 503.7 ms by vehicle; " in flight_lines(fly_virtual(scenario).summary)["delay"]
 
 
-def test_a_flight_in_hand_throughout_says_nothing_of_modes() -> None:
+def test_a_flight_nominal_throughout_says_nothing_of_modes() -> None:
     calm = load(located("chain3")).model_copy(update={"duration_s": 5.0})
     assert "modes" not in flight_lines(fly_virtual(calm).summary)
 
 
-def test_broken_flight_is_not_told_that_errors_do_not_grow() -> None:
-    """Of the set-points 70 % are lost, which the station cannot see: by what it measures, much headroom is left."""
+def test_a_broken_flight_makes_no_claim_about_growth() -> None:
+    """70 % of the set-points are lost, which the station cannot see: by what it measures, much headroom is left."""
     calm, lossy = Link(delay_s=0.02), Link(delay_s=0.02, loss_probability=0.7)
     chain = load(located("chain3"))
     safety = chain.safety.model_copy(update={"setpoint_timeout_s": 100.0, "heartbeat_timeout_s": 100.0})
@@ -50,7 +50,7 @@ def test_broken_flight_is_not_told_that_errors_do_not_grow() -> None:
 
 
 def test_unknown_verdict_says_what_is_unknown() -> None:
-    """Nothing reaches the last vehicle from 5 s on, which keeps flying."""
+    """From 5 s on, nothing reaches the last vehicle, which keeps flying."""
     calm = Link(delay_s=0.02)
     dead = calm.model_copy(update={"outages": (Outage(from_s=5.0, until_s=100.0),)})
     chain = load(located("chain3"))

@@ -57,7 +57,7 @@ def test_the_figures_forget_what_was_before_the_last_seconds() -> None:
 
 
 def test_at_the_end_figures_are_those_of_the_last_commands() -> None:
-    """Vehicles that hold are back at the fastest gains, whose headroom nobody flies with."""
+    """Vehicles that hold are back at the fastest gains, but nothing is flown with their headroom."""
     ticks = ticks_of(line(2), start_s=0.0, count=60)
     ticks["commanded"][:50], ticks["gain_set"][:50], ticks["headroom"][:50] = True, 1, 0.4
     ticks["headroom"][50:] = -0.5

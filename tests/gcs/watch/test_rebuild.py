@@ -1,4 +1,4 @@
-"""A telemetry log alone gives the figures of the flight that it is of."""
+"""A telemetry log alone gives the figures of its flight."""
 
 from collections import Counter
 from functools import cache
@@ -48,7 +48,7 @@ FLIGHTS: dict[str, tuple[str, float, float | None]] = {
 }
 """Scenario, duration in s, link delay in s."""
 MICROSECOND = 2e-6
-"""Times in a log are whole µs, and a delay has two."""
+"""Times in a log are whole µs, and a delay is the difference of two."""
 
 
 def scenario_of(flight: str) -> Scenario:
@@ -93,7 +93,7 @@ def test_verdict_reason_and_ticks_are_those_of_the_flight(flight: str) -> None:
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_latencies_and_headroom_are_those_of_the_flight(flight: str) -> None:
     summary, rebuilt = both(flight)
-    # Where delays vary one exchange more or less, before or after the flight, moves a median from sample to sample.
+    # Where delays vary, one exchange more or less before or after the flight moves a median to another sample.
     bound_s = 1e-3 if flight == "jitter and loss" else MICROSECOND
     pairs: list[tuple[Any, Any, str]] = [(summary, rebuilt, "loop_delay_s")]
     for was, found in zip(summary.vehicles, rebuilt.vehicles, strict=True):
@@ -113,7 +113,7 @@ def test_latencies_and_headroom_are_those_of_the_flight(flight: str) -> None:
 @pytest.mark.parametrize("flight", FLIGHTS)
 def test_errors_and_distances_are_those_of_the_flight(flight: str) -> None:
     summary, rebuilt = both(flight)
-    # A µs at 100 m/s is 0.1 mm; a state of a vehicle ahead that is taken from before a late exchange, some more.
+    # A µs at 100 m/s is 0.1 mm; a state of the vehicle ahead from before a late exchange is off by more.
     bound_m = 2e-3 if flight == "jitter and loss" else 2e-4
     assert rebuilt.distance_min_m == pytest.approx(summary.distance_min_m, abs=bound_m)
     for was, found in zip(summary.vehicles, rebuilt.vehicles, strict=True):
@@ -139,11 +139,11 @@ def test_modes_losses_and_lateness_are_those_of_the_flight(flight: str) -> None:
             assert abs(getattr(found, name) - getattr(was, name)) <= 2  # of what arrives after the last tick
 
 
-def test_the_gains_did_change_where_the_test_says_so() -> None:
+def test_the_flight_named_gains_change_does_change_gains() -> None:
     summary, rebuilt = both("gains change")
     assert "CAUTION -> CRITICAL" in {event.text for event in summary.mode_changes}
     assert known(rebuilt.loop_delay_s.max) > 2 * known(rebuilt.delay_margin_s)
-    assert known(rebuilt.headroom_min) > 0  # against the margins of the slower gains, and the first would be at -1
+    assert known(rebuilt.headroom_min) > 0  # against the margins of the slower gains; against the first it would be -1
 
 
 def overheard(*, requests: bool) -> tuple[bytes, TickArray]:
@@ -178,7 +178,7 @@ def test_another_tools_log_gives_links_and_errors_but_no_verdict(requests: bool)
         assert found.size > 250
         for axis in ("spacing_error_north_m", "spacing_error_east_m"):
             at_the_same_time = np.interp(found["due_ns"] - log_ns[0], log_ns - log_ns[0], was[axis])
-            # At up to 20 m/s of difference, looked at up to a tick apart.
+            # Errors change at up to 20 m/s, and the two are up to a tick apart.
             assert np.abs(found[axis] - at_the_same_time).max() < 0.4
             assert np.median(np.abs(found[axis] - at_the_same_time)) < 0.01
 
@@ -247,7 +247,7 @@ def test_a_vehicle_on_the_ground_is_known_from_its_log() -> None:
     assert rebuilt.distance_min_m == pytest.approx(summary.distance_min_m, abs=0.01)
 
 
-def test_without_a_scenario_the_links_are_all_that_is_told() -> None:
+def test_without_a_scenario_only_the_links_are_reported() -> None:
     data, _ = overheard(requests=True)
     result = rebuild_report(parse_tlog(data), LogSource(Path("other.tlog"), None, None, None))
     assert "flight" not in result.to_dict()

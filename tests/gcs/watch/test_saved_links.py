@@ -74,7 +74,7 @@ def test_every_shipped_profile_can_be_flown_and_names_its_source() -> None:
         assert scenario.links.up == profile.up
 
 
-def test_unknown_profile_is_one_line(tmp_path: Path) -> None:
+def test_an_unknown_profile_is_refused(tmp_path: Path) -> None:
     text = (FOLDER / "chain3.toml").read_text(encoding="utf-8")
     file = tmp_path / "own.toml"
     file.write_text(text.split("[links]")[0] + '[links]\nprofile = "nope"\n', encoding="utf-8")
@@ -113,7 +113,7 @@ def measured_of(said: list[Said], others: tuple[tuple[int, mavlink.Frame], ...] 
 
 
 def test_a_camera_with_the_vehicles_id_loses_no_frames() -> None:
-    """It numbers its frames apart."""
+    """It numbers its frames separately."""
     cameras = []
     for k in range(100):
         data = mavlink.encode(mavlink.HEARTBEAT, (0, 30, 8, 0, 4, 3), sequence=77 + k, system_id=1)
@@ -124,7 +124,7 @@ def test_a_camera_with_the_vehicles_id_loses_no_frames() -> None:
     assert (measured.up.datagrams > 100, measured.up.lost) == (True, 0)
 
 
-def test_overtaken_frames_are_not_lost_but_overtaken() -> None:
+def test_overtaken_frames_count_as_reordered_not_lost() -> None:
     said = [each for k in range(100) for each in exchange(k, 50 * k)]
     late = [(ms + (60 if sequence % 20 == 10 else 0), sequence, kind, fields) for ms, sequence, kind, fields in said]
     measured, up = measured_of(late)
@@ -142,7 +142,7 @@ def test_a_run_of_losses_of_any_length_is_counted(exchanges: int) -> None:
 
 @pytest.mark.parametrize("jump_ms", [-3_000, 2_000])
 def test_a_clock_that_jumps_delays_nothing(jump_ms: int) -> None:
-    """Positions between the jump and the next exchange tell no delay, nor do old ones that are sent once more."""
+    """Positions between the jump and the next exchange show no delay, nor do old ones that are sent once more."""
     boots_ms = [10_000 + 50 * k for k in range(200)]
     said = [each for k, boot_ms in enumerate(boots_ms[:100]) for each in exchange(k, boot_ms)]
     said += (

@@ -124,7 +124,7 @@ def test_messages_of_another_dialect_are_stepped_over() -> None:
     assert log.counters == {"unknown message": 1}
 
 
-def test_a_file_without_a_frame_is_one_line(tmp_path: Path) -> None:
+def test_a_file_without_a_frame_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "empty.tlog"
     file.touch()
     with pytest.raises(InputError, match="read no MAVLink frame in 0 bytes"):

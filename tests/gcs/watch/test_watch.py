@@ -1,4 +1,4 @@
-"""Links watched from aside: what is said of their delays against the truth, in virtual time, and what is not done."""
+"""Links watched without commanding: their reported delays against the truth, and what is not sent, in virtual time."""
 
 import io
 from collections import Counter
@@ -38,7 +38,7 @@ def linked(up: Link, down: Link) -> Scenario:
 
 
 class Watched:
-    """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
+    """A fleet that nobody flies, and a watch of it; a test can add the datagrams of a station."""
 
     def __init__(
         self,
@@ -56,10 +56,10 @@ class Watched:
         self.now_ns, self._late_ns = START_NS, late_ns
         self.sent: list[bytes] = []
         self.true_ages_s: list[float] = []
-        """Of the first vehicle's newest state, at each look."""
+        """The age of the first vehicle's newest state at each look."""
 
     def run(self, seconds: float, station: list[tuple[int, bytes, int]] | None = None) -> None:
-        """Go on in steps of a millisecond; `station`: datagrams (system id, bytes, ns) of a station beside."""
+        """Advance in steps of a millisecond. `station`: datagrams (system id, bytes, ns) of a station alongside."""
         due = sorted(station or [], key=lambda entry: entry[2])
         end_ns = self.now_ns + round(seconds * 1e9)
         to_vehicles: list[tuple[int, bytes, int]] = []
@@ -90,7 +90,7 @@ class Watched:
 
 
 class Peer:
-    """A vehicle that says what a test wants."""
+    """A vehicle that sends what a test wants."""
 
     def __init__(self, system_id: int, port: int = 1) -> None:
         self._system_id, self._address, self._sequence = system_id, port, 0
@@ -121,10 +121,10 @@ def test_round_trips_and_loop_delays_match_links_to_the_microsecond(late_ns: int
     np.testing.assert_allclose(vehicle.rtt_s, 0.1, atol=1e-6)
     # Up was slower than down by 40 ms, so the clock is off by 20 ms; the loop delay is not.
     late_s = np.array(vehicle.age_s) - watched.true_ages_s
-    told = np.isfinite(late_s) & (np.arange(late_s.size) > 30)
-    assert told.sum() > 30
-    np.testing.assert_allclose(late_s[told], -0.02, atol=1e-5)
-    np.testing.assert_allclose((np.array(vehicle.loop_delay_s) - watched.true_ages_s)[told], 0.03, atol=1e-5)
+    settled = np.isfinite(late_s) & (np.arange(late_s.size) > 30)
+    assert settled.sum() > 30
+    np.testing.assert_allclose(late_s[settled], -0.02, atol=1e-5)
+    np.testing.assert_allclose((np.array(vehicle.loop_delay_s) - watched.true_ages_s)[settled], 0.03, atol=1e-5)
     figures = watched.watch.figures(watched.now_ns, Design(delay_margin_s=0.5))[0]
     # Half a round trip, and what a clock may drift since the newest reply was read, by then 0.05 to 0.2 s ago.
     assert 0.05 < known(figures.clock.bound_s) < 0.05 + 1e-3 * 0.25
@@ -142,9 +142,9 @@ def test_round_trips_and_loop_delays_match_links_to_the_microsecond(late_ns: int
 def test_repetition_is_no_loop_delay_to_an_onlooker_either(
     telemetry_hz: float, station: bool, longest_s: float
 ) -> None:
-    """Vehicles report at 4 Hz, over 150 ms each way; the tick, at 20 Hz, is at most 50 ms off.
+    """Vehicles report at 4 Hz, over 150 ms each way; the tick, at 20 Hz, adds at most 50 ms.
 
-    What a station at 20 Hz would not get although it asks is late.
+    If a station asks for 20 Hz, the states that it does not get count as late.
     """
     far = linked(Link(delay_s=0.15), Link(delay_s=0.15))
     watched = Watched(far, timesync_hz=10.0, rates=Rates(control_hz=20.0, telemetry_hz=telemetry_hz))
@@ -264,7 +264,7 @@ def test_any_stream_is_taken_and_figures_are_plain_numbers(
         watch.look(now_ns)
     [figures] = watch.figures(now_ns, Design(delay_margin_s=0.3))
     assert figures.system_id == 1
-    figures.to_json()  # which has no infinity
+    figures.to_json()  # JSON has no infinity
 
 
 @pytest.mark.parametrize("width", [50, 72, 73, 80, 83, 84, 145, 146, 200])
@@ -299,7 +299,7 @@ def test_lost_positions_lengthen_the_effective_loop_delay() -> None:
 
 @pytest.mark.parametrize("asked", [False, True])
 def test_positions_come_if_requested_or_else_a_reason_is_given(asked: bool) -> None:
-    """Copters send none by themselves, as ArduPilot. Those that do are not asked again."""
+    """Like ArduPilot, copters send none unasked. Those that send positions are not asked again."""
     watched = Watched(three(), timesync_hz=10.0, position_hz=20.0 if asked else 0.0)
     watched.run(8.0)
     vehicles = watched.watch.figures(watched.now_ns, None)
@@ -329,7 +329,7 @@ def test_positions_come_if_requested_or_else_a_reason_is_given(asked: bool) -> N
         (None, (), RATES_UNKNOWN),
     ],
 )
-def test_slow_positions_are_told_with_what_they_do(
+def test_slow_positions_are_reported_with_their_effect(
     wanted_hz: float | None, stations: tuple[int, ...], said: str
 ) -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
@@ -341,8 +341,8 @@ def test_slow_positions_are_told_with_what_they_do(
     )  # fmt: skip
     text = io.StringIO()
     Console(file=text, width=80).print(render(report, width=80))
-    told = [line for line in text.getvalue().splitlines() if "position" in line]
-    assert told == ([said] if said else [])
+    printed = [line for line in text.getvalue().splitlines() if "position" in line]
+    assert printed == ([said] if said else [])
 
 
 @pytest.mark.parametrize(("delay_s", "failed"), [(0.2, True), (0.01, False)])
