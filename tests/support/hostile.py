@@ -31,7 +31,7 @@ _WIDTH = {"b": 8, "h": 16, "i": 32, "q": 64}
 
 
 def any_message(rng: np.random.Generator, count: int, system_ids: list[int], left_out: set[int]) -> list[bytes]:
-    """Frames of any message but some, with any content and length, and the checksum right."""
+    """Frames of any message except those left out, with any content and length, and a correct checksum."""
     messages = [number for number in MESSAGES if number not in left_out]
     lengths = rng.integers(0, 256, size=count).tolist()
     sources = rng.choice(system_ids, size=count).tolist()

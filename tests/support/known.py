@@ -2,6 +2,6 @@
 
 
 def known(value: float | None) -> float:
-    """The figure, which is there."""
+    """The figure; an error if it is unknown."""
     assert value is not None
     return value

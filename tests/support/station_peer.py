@@ -17,7 +17,7 @@ HOME = address_at("127.0.0.1", 5001)
 
 
 class Peer:
-    """One vehicle played by pymavlink: what it says and what it was told."""
+    """One vehicle played by pymavlink: the datagrams that it sends."""
 
     def __init__(self, system_id: int, address: Address = HOME, *, component: int = 1) -> None:
         self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component)

@@ -23,7 +23,7 @@ TRUTH = Response(lag_s=COPTERS5.autopilot.lag_s, velocity_gain_1_s=COPTERS5.auto
 
 
 def three(*, duration_s: float = 15.0, up_down: Link | None = None, **changes: Any) -> Scenario:
-    """The leader and one platoon of copters5, with an autopilot changed."""
+    """The leader and one platoon of copters5, with these changes to their autopilots."""
     kept: dict[str, Any] = {"vehicles": COPTERS5.vehicles[:3], "duration_s": duration_s}
     links = Links(up=up_down, down=up_down) if up_down else COPTERS5.links
     autopilot = COPTERS5.autopilot.model_copy(update=changes)

@@ -1,4 +1,4 @@
-"""Vehicles in a process of their own, for the tests with clients of other people's."""
+"""Vehicles in a process of their own, for the tests with other people's clients."""
 
 import contextlib
 import subprocess
@@ -15,7 +15,7 @@ from tests.support.processes import PATIENCE_S, free_port
 
 
 def until(condition: Callable[[], Any], what: str) -> None:
-    """Wait for what a client's threads or processes do meanwhile."""
+    """Wait for a condition that a client's threads or processes bring about."""
     end_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < end_s, f"{what}: not after {PATIENCE_S} s"

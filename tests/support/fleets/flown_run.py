@@ -18,7 +18,7 @@ PERIOD_S = 0.02
 
 
 def line(count: int) -> Scenario:
-    """A scenario of `count` vehicles in line, 30 m behind and 40 m aside of each other."""
+    """A scenario of `count` vehicles in line, each 30 m behind and 40 m east of the one ahead."""
     ids = ids_of(count)[::-1]  # so that the scenario's order is not that of the system ids
     vehicles = tuple(
         Vehicle(
@@ -71,7 +71,7 @@ def prepare(folder: Path, scenario: Scenario) -> RunWriter:
 
 
 def write_run(folder: Path, scenario: Scenario, ticks: TickArray) -> None:
-    """A finished run of these ticks, with a word at the beginning and the end."""
+    """A finished run of these ticks, with an event at the beginning and one at the end."""
     writer = prepare(folder, scenario)
     writer.event(Event(time_s=float(ticks["time_s"][0, 0]), kind="phase", text="connecting"))
     for rows in ticks:

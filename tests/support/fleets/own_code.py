@@ -42,7 +42,7 @@ def lagged(state, command, dt_s, memory):
     moved = dt_s * velocity + dt_s**2 / 2.0 * command + LAG_S * (dt_s - gone) * (was - command)
     return np.concatenate([position + moved, velocity_after])
 """
-"""The law of the gains of `given`, alike and saturating, and dynamics: the double integrator, alike and with a lag."""
+"""The law with the gains of `given`, exact and saturating; as dynamics, the double integrator, exact and with a lag."""
 GIVEN = FixedGains(K1=-5.0, K2=0.5, K3=9.0)
 
 
