@@ -18,8 +18,8 @@ from gains.performance.robust import subsystem_loop
 from gains.performance.scalar_gains import decay_rate_of, least_singular_value
 
 
-def test_at_every_delay_a_resting_loop_has_a_zero_root() -> None:
-    """x'(t) = -x(t) + x(t - tau); a slow decay beside a fast one is no standstill."""
+def test_a_loop_that_can_rest_is_singular_at_every_delay() -> None:
+    """x'(t) = -x(t) + x(t - tau) rests at any x; a slow decay beside a fast one is no rest."""
     assert is_singular_for_any_delay([np.array([[-1]]), np.array([[1]])])
     assert not is_singular_for_any_delay([np.diag([-1e9, -1e-9])])
 

@@ -1,4 +1,4 @@
-"""The names that `gains` exports: whole, documented, and loaded only when they are used."""
+"""The names that `gains` exports: complete, documented, and loaded only when they are used."""
 
 import doctest
 import inspect

@@ -1,4 +1,4 @@
-"""What is no number of seconds, no rate and no model is refused in one line that names it."""
+"""Arguments that are not a number of seconds, a rate or a model are refused in one line that names them."""
 
 from collections.abc import Callable
 from typing import Any

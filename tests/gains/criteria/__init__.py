@@ -1,1 +1,1 @@
-"""What a design can be asked for beside margin, robustness and decay."""
+"""What a design can be asked for besides margin, robustness and decay."""

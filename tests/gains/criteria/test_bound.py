@@ -10,7 +10,7 @@ FOLLOWER = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
 
 
 def is_reached(gamma: float, late_s: float, price: float, steps: int = 400) -> bool:
-    """The same test with X from an ordinary differential equation and the norm from a matrix of samples."""
+    """The same test with X from SciPy's Riccati solver and the norm from a matrix of samples."""
     from scipy.linalg import expm, solve_continuous_are
 
     A, B = FOLLOWER
@@ -46,7 +46,7 @@ def test_price_of_commands_does_not_matter_to_four_digits() -> None:
 
 def test_bound_falls_with_delay_from_one() -> None:
     bounds = [alpha_bound(*FOLLOWER, late_s) for late_s in (0.0, 0.07, 0.31, 1.01)]
-    assert bounds[0] == pytest.approx(1.0, abs=1e-6)  # |c| / √(1 + c²) of the source for c without bound
+    assert bounds[0] == pytest.approx(1.0, abs=1e-6)  # |c| / √(1 + c²) of the source as c grows
     assert bounds[2] == pytest.approx(0.9538, abs=1e-4)
     assert bounds == sorted(bounds, reverse=True)
 

@@ -1,4 +1,4 @@
-"""Gains searched for what is asked: met, or refused with relaxations that are feasible.
+"""Gains searched for criteria: these are met, or refused with relaxations that are feasible.
 
 Searches over all entries of a gain take up to a minute each. Those that take longest are left out, unless asked for:
 SLOW_TESTS=1 python3 make.py test tests/gains/criteria/test_for_delay.py
@@ -38,7 +38,7 @@ MOST = "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max", "
 def figures_of(
     method: Any, delay_margin_s: float | None, *, string_peak_max: float = 1.0, **criteria: Any
 ) -> LoopFigures:
-    """What the gains reach that are designed to criteria, with exact figures."""
+    """The exact figures of gains that are designed to criteria."""
     wanted = Requirement(delay_margin_s, string_peak_max=string_peak_max, criteria=Criteria(**criteria))
     timing, delay_s = FlownTiming(np.inf, PERIOD_S), criteria.get("at_delay_s")
     if method == "inclusion":
@@ -74,7 +74,7 @@ QUICK = [("inclusion", 0), ("inclusion", 1), ("inclusion", 4), ("inclusion", 5),
 )
 def test_a_criterion_is_met(method: str, margin_s: float | None, criteria: dict[str, Any]) -> None:
     figures = figures_of(method, margin_s, **criteria)
-    assert figures.delay_margin_s >= (margin_s or 0.3)  # those for a delay take it
+    assert figures.delay_margin_s >= (margin_s or 0.3)  # gains for a delay tolerate it
     for name, wanted in criteria.items():
         if name in MOST:
             assert getattr(figures, name) <= wanted
@@ -122,7 +122,9 @@ BOTH = WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5}
         ("graph-lqr", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
     ],
 )
-def test_what_a_refusal_names_can_be_had(method: str, criteria: dict[str, Any], named: set[str]) -> None:
+def test_the_relaxations_that_a_refusal_names_are_feasible(
+    method: str, criteria: dict[str, Any], named: set[str]
+) -> None:
     margin_s = None if "at_delay_s" in criteria else 0.1
     with pytest.raises(InfeasibleError, match="exclude each other") as refused:
         figures_of(method, margin_s, **criteria)
@@ -210,14 +212,14 @@ def test_alpha_in_discrete_time_tends_to_that_with_half_hold() -> None:
         assert replace(figures, discrete=True).alpha_at_delay == pytest.approx(figures.alpha_at_delay, rel=2e-3)
 
 
-def test_best_alpha_at_a_delay_exceeds_that_of_twice_margin() -> None:
-    today = design(CHAIN, Requirement(delay_margin_s=0.6, string_peak_max=1.0), period_s=PERIOD_S)
-    own = [gain[:1, :1] for gain in (today.K1, today.K2, today.K3)]
+def test_best_alpha_at_delay_exceeds_that_for_twice_the_margin() -> None:
+    doubled = design(CHAIN, Requirement(delay_margin_s=0.6, string_peak_max=1.0), period_s=PERIOD_S)
+    own = [gain[:1, :1] for gain in (doubled.K1, doubled.K2, doubled.K3)]
     timing = FlownTiming(np.inf, PERIOD_S)
     before = LoopFigures(PAIR, PAIR.overlapping_gain(*own), timing, 0.3).alpha_at_delay
     found = criteria_gains(Requirement(criteria=Criteria(at_delay_s=0.3)), PERIOD_S)
     assert before < 0.55
-    # 0.632 is known of static gains at this delay; the search ends within half a per cent
+    # static gains are known to reach 0.632 at this delay; the search ends within half a per cent
     assert found.alpha == pytest.approx(0.632, rel=5e-3)
 
 

@@ -54,7 +54,7 @@ def test_published_gain_of_loops_with_one_or_two_delays(
     assert loop_gain(terms, B, C) == pytest.approx(published, rel=2e-5)
 
 
-def test_spacing_gain_is_where_feedback_of_it_destabilises() -> None:
+def test_spacing_gain_is_the_inverse_of_the_least_destabilising_feedback() -> None:
     figures = LoopFigures(PAIR, K, FlownTiming(np.inf, 0.02), 0.15)
     gain, late_s = figures.spacing_gain_max_s2, 0.16
     C = np.array([[0.0, 1.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Figures of predicted loops agree with those of other code, and with a loop that is simulated."""
+"""Figures of loops with prediction agree with those of other code, and with a simulated loop."""
 
 from math import inf
 
@@ -24,7 +24,7 @@ RESPONSES = None, Response(lag_s=0.05, velocity_gain_1_s=2.0)
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_predicting_over_nothing_is_no_prediction(response: Response | None) -> None:
+def test_prediction_over_no_delay_is_no_prediction(response: Response | None) -> None:
     responses = None if response is None else (response, response)
     predicted = PredictedFigures(PAIR, K, PERIOD_S, 0.0, (0.15,), response=response)
     plain = LoopFigures(PAIR, K, FlownTiming(inf, PERIOD_S), 0.15, responses=responses)
@@ -33,8 +33,8 @@ def test_predicting_over_nothing_is_no_prediction(response: Response | None) -> 
         assert getattr(predicted, name) == pytest.approx(getattr(plain, name), rel=1e-5), name
 
 
-def test_noise_passes_a_prediction_as_a_simulated_loop_says() -> None:
-    """Second way: the sum of squares of the commands that a pulse of noise on each state leads to."""
+def test_noise_gain_with_prediction_is_that_of_a_simulated_loop() -> None:
+    """Second way: the sum of squares of the commands that a pulse of noise on each state causes."""
     late, delay_s = 5, 0.1
     Phi, G = np.eye(3) + PERIOD_S * PAIR.A, PERIOD_S * PAIR.B + PERIOD_S**2 / 2.0 * PAIR.A @ PAIR.B  # A A = 0
     power = np.zeros(2)
@@ -51,7 +51,7 @@ def test_noise_passes_a_prediction_as_a_simulated_loop_says() -> None:
 
 
 def test_noise_near_the_edge_of_the_window_agrees_with_simulation() -> None:
-    """As above, of all states at once: assumed 0.6 s, true 0.76 s. Motions decay in 7800 ticks."""
+    """As above, for all states at once: assumed 0.6 s, true 0.76 s. Motions decay in 7800 ticks."""
     assumed, late = 30, 38
     Phi, G = np.eye(3) + PERIOD_S * PAIR.A, PERIOD_S * PAIR.B + PERIOD_S**2 / 2.0 * PAIR.A @ PAIR.B
     gain = PAIR.overlapping_gain([[-3.4]], [[0.631]], [[5.4]])
@@ -68,7 +68,7 @@ def test_noise_near_the_edge_of_the_window_agrees_with_simulation() -> None:
 
 
 def test_gains_with_prediction_decay_faster_within_a_mismatch() -> None:
-    """2.32 1/s at least, of a search on a grid, where static gains decay at 0.96 1/s; stable from 0.48 to 0.72 s."""
+    """At least the 2.32 1/s of a grid search, where static gains decay at 0.96 1/s; stable from 0.48 to 0.72 s."""
     criteria = Criteria(0.6, "decay_rate_at_delay_1_s", delays_s=(0.48, 0.72), delay_rate=0.0)
     found = predicted_gains(Requirement(criteria=criteria), PERIOD_S)
     gain = PAIR.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
@@ -80,7 +80,7 @@ def test_gains_with_prediction_decay_faster_within_a_mismatch() -> None:
 
 
 def test_the_search_comes_near_the_most_robust_gains() -> None:
-    """0.2843 at 1.0 s, stable within 20 % of it: a simplex search over another code's window, from several starts."""
+    """A simplex search with another code's window found 0.2843 at 1.0 s, stable within 20 % of it."""
     criteria = Criteria(1.0, "alpha_at_delay", delays_s=(0.8, 1.2), delay_rate=0.0)
     found = predicted_gains(Requirement(criteria=criteria, string_peak_max=1.0), PERIOD_S)
     assert found.alpha > 0.98 * 0.2843
@@ -90,7 +90,7 @@ DECAY_1_S = 1.735
 
 
 def test_least_gains_have_the_least_k1_and_k3() -> None:
-    """Of all on a grid whose sampled matrix without delay has its eigenvalues within e^{-sigma T}."""
+    """Of all gains on a grid whose sampled loop without delay has its eigenvalues within e^{-sigma T}."""
     least = np.array(least_gains(DECAY_1_S, PERIOD_S))
     first, last = (axis.ravel() for axis in np.meshgrid(*np.outer(least, np.linspace(0.5, 2.0, 61)), indexing="ij"))
     step = np.array([[1.0, PERIOD_S], [0.0, 1.0]])  # e' = v, v' = u = -k1 v - k3 e
@@ -103,7 +103,7 @@ def test_least_gains_have_the_least_k1_and_k3() -> None:
 
 
 def tolerates(k1: float, k3: float, late_s: float, share: float) -> bool:
-    """Whether the continuous loop is stable within a share, by crossings of the limit: roots of
+    """Whether the continuous loop is stable up to a share of mismatch, by roots on the axis of
 
     s^2 + k1 s + k3 + ((k1 + k3 tau^) s + k3) (e^{-s tau} - e^{-s tau^}).
     """
@@ -134,12 +134,14 @@ def test_no_gains_that_decay_as_fast_tolerate_longer(share: float, reached_s: fl
     criteria = Criteria(longest_s, "decay_rate_at_delay_1_s", delays_s=around_s, delay_rate=0.0)
     found = predicted_gains(Requirement(criteria=criteria, string_peak_max=1.0), PERIOD_S)
     figures = PredictedFigures(PAIR, found.K, PERIOD_S, longest_s, (longest_s,))
-    assert 0.975 * DECAY_1_S < figures.decay_rate_at_delay_1_s < 1.001 * DECAY_1_S  # it stops 0.3 to 1.7 % short
+    assert (
+        0.975 * DECAY_1_S < figures.decay_rate_at_delay_1_s < 1.001 * DECAY_1_S
+    )  # the search stops 0.3 to 1.7 % short
 
 
 @pytest.mark.parametrize(("mismatch_s", "decay_1_s"), [(1e-4, 1.515), (1e-3, 1.285), (0.054, 0.296)])
 def test_a_mismatch_parts_the_double_root(mismatch_s: float, decay_1_s: float) -> None:
-    """Of the least gains at 2.159 s, sampled, and as the continuous loop whose root is double in continuous time."""
+    """Of the least gains of the sampled loop at 2.159 s, and of the gains whose continuous loop has a double root."""
     k1, k3 = least_gains(DECAY_1_S, PERIOD_S)
     for own, spacing, thinned in ((k1, k3, 1), (2.0 * DECAY_1_S, DECAY_1_S**2, 2)):
         gain = ScalarGains(own, 0.2 * own, spacing, 0.0).K
@@ -148,7 +150,7 @@ def test_a_mismatch_parts_the_double_root(mismatch_s: float, decay_1_s: float) -
 
 
 def test_the_longest_assumed_delay_has_two_limits() -> None:
-    """Unstable gains take none; slow gains tolerate 5 % of the longest that is asked for."""
+    """Unstable gains tolerate none; slow gains tolerate 5 % of the longest that is asked for."""
     assert longest_assumed_s(ScalarGains(1.0, 0.0, -1.0, 0.0), PERIOD_S, 0.05, 10.0) == 0.0
     assert longest_assumed_s(ScalarGains(0.2, 0.0, 0.01, 0.0), PERIOD_S, 0.05, 10.0) == 10.0
 

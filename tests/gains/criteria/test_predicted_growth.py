@@ -29,14 +29,14 @@ def test_robustness_and_string_peaks_are_those_of_the_published_text(
     assumed_s: float, alpha: float, half_way_up: float
 ) -> None:
     matched = follower(GAINS, assumed_s, assumed_s)
-    # printed with two digits, of which the last is off by one where it was cut off
+    # printed with two digits, some of them truncated
     assert matched.alpha_at_delay == pytest.approx(alpha, abs=5e-3)
     assert matched.string_peak == pytest.approx(1.0, abs=1e-9)
     late = follower(GAINS, assumed_s, (assumed_s + matched.window_s[1]) / 2.0)
     assert round(late.string_peak, 2) == half_way_up
 
 
-def test_without_prediction_it_is_the_flown_loop() -> None:
+def test_figures_without_prediction_are_those_of_the_flown_loop() -> None:
     """An assumed delay of 0 is the loop of `gains.performance.flown`, up to the second order of the period."""
     for response in (None, Response(0.1, 0.0), Response(0.2, 1.5)):
         margin_s = follower(GAINS, 0.0, 0.0, response).window_s[1]
@@ -82,7 +82,7 @@ def test_a_whole_chains_matrix_has_the_formulas_ratios_and_signs(assumed_s: floa
         z = np.exp(1j * omega * PERIOD_S)
         seen = held(PERIOD_S) + ahead @ (entry(z, delay_s) - entry(z, assumed_s))
         loop = np.eye(4) - K @ np.linalg.solve(z * np.eye(n) - expm(model.A * PERIOD_S), seen)
-        # what the first vehicle is told beside its law reaches all behind it
+        # an extra command to the first vehicle reaches all behind it
         told = np.linalg.solve(loop, np.array([[1.0], [share], [share**2], [share**3]]))[:, 0]
         assert told[2] / told[1] == pytest.approx(told[3] / told[2], rel=1e-6)
         growth.append(abs(told[2] / told[1]))

@@ -96,17 +96,17 @@ def test_sweep_along_the_circle_agrees(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_margin_scales_with_time_and_is_free_of_coordinates(seed: int) -> None:
+def test_margin_scales_with_time_and_does_not_depend_on_coordinates(seed: int) -> None:
     terms = random_terms(seed)
     margin_s = analyse_delay(*terms).delay_margin_s
     assert analyse_delay(*[310.0 * matrix for matrix in terms]).delay_margin_s == pytest.approx(margin_s / 310.0)
     T = np.random.default_rng(seed).normal(size=terms[0].shape) + 3.0 * np.eye(len(terms[0]))
     turned = [np.linalg.solve(T, matrix @ T) for matrix in terms]
-    # a similarity of condition number up to some hundreds costs as many digits
+    # a similarity of condition number up to some hundreds costs that many roundings
     assert analyse_delay(*turned).delay_margin_s == pytest.approx(margin_s, rel=1e-8)
 
 
-def test_large_block_leaves_the_frequencies_to_the_sweep() -> None:
+def test_margin_of_a_large_block_is_where_its_root_crosses() -> None:
     rng = np.random.default_rng(3)
     size = 21
     terms = [rng.normal(size=(size, size)) for _ in range(3)]
@@ -145,7 +145,7 @@ def analyse_mixed(terms: list[DelayedTerm], horizon_s: float | None = None) -> D
     return combined_analysis([analyse_mixed_block(block, terms, False) for block in blocks], horizon_s)
 
 
-def test_known_delay_beside_the_unknown_shortens_it() -> None:
+def test_a_known_delay_beside_the_unknown_shortens_the_margin() -> None:
     # x' = -x(t - 0.1 - tau): pi / 2 less what is known
     analysis = analyse_mixed([DelayedTerm(np.array([[-1.0]]), 0.1, 1)])
     assert analysis.delay_margin_s == pytest.approx(pi / 2.0 - 0.1, rel=1e-12)
@@ -248,7 +248,7 @@ def test_roots_of_many_multiples_are_counted(
         assert found.unstable_roots_at_zero_delay + entered == unstable_roots([(now, 0.0), *delayed])
 
 
-def test_pair_on_axis_without_delay_beside_a_root_at_zero() -> None:
+def test_a_pair_on_the_axis_beside_zero_leaves_no_margin() -> None:
     # det M(s) = s (s^2 + c e^{-s tau}): no root is left to be taken for noise of the one at zero
     now = np.array([[0.0, 0.0, -0.10632528972641878], [0.0, 0.0, 0.0], [0.0, 0.6401019196602797, 0.0]])
     late = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.7418610417423701], [-0.318665534371544, 0.0, 0.0]])
@@ -261,9 +261,9 @@ def test_pair_on_axis_without_delay_beside_a_root_at_zero() -> None:
         }
 
 
-def test_a_defective_angle_leaves_the_slopes_at_the_others() -> None:
+def test_a_defective_angle_leaves_slopes_at_other_angles_unchanged() -> None:
     # at the angle 0 three states form one Jordan block, whose eigenvectors are exactly parallel; elsewhere the terms
-    # D e^{-j theta} - D e^{-2 j theta} part its eigenvalues
+    # D e^{-j theta} - D e^{-2 j theta} separate its eigenvalues
     chain, parts = np.zeros((4, 4)), np.diag([1.0, 2.0, 3.0, -1.0])
     chain[0, 1] = chain[1, 2] = 1.0
     theta = np.array([1.0, 2.0])

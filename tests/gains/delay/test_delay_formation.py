@@ -82,7 +82,7 @@ def test_400_followers_are_analysed_once() -> None:
 
 
 def thesis_loop() -> tuple[Matrix, Matrix, Matrix]:
-    """A, B, K of the three-vehicle platoon with the gains printed in chapter 5 (the slip 0.5003 read as 10.5003)."""
+    """A, B, K of the three-vehicle platoon with the gains printed in chapter 5 (misprint 0.5003 read as 10.5003)."""
     identity, zero = np.eye(2), np.zeros((2, 2))
     A = np.block(
         [

@@ -115,7 +115,7 @@ def test_opposite_crossings_at_one_frequency_are_both_found(seed: int) -> None:
     )
     together = analyse_delay(*side_by_side(slow, fast, seed=seed))
     found = [(crossing.delay_s, crossing.omega_rad_s, crossing.direction) for crossing in together.crossings]
-    # two roots on one place of the axis: a digit or two less than alone
+    # two roots at one point of the axis cost a digit or two
     assert found == [pytest.approx(crossing, rel=1e-10) for crossing in alone]
 
 
@@ -149,7 +149,7 @@ def test_listing_may_stop_at_a_horizon() -> None:
     assert (everything.complete_to_s, up_to_8.complete_to_s) == (inf, 8.0)
 
 
-# at zero delay a pair on the axis leaves it to the left, then to the right
+# a pair on the axis at zero delay leaves it to the left in the first case, to the right in the second
 @pytest.mark.parametrize("delayed", [-0.4, 0.4])
 def test_pair_on_axis_is_unstable_only_if_it_moves_right(delayed: float) -> None:
     A0, A1 = second_order(0.0, 1.0, delayed)

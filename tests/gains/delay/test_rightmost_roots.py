@@ -27,7 +27,7 @@ def test_further_roots_leave_those_found_before_as_they_are() -> None:
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize(("now", "late", "delay_s"), [(-10.0, 0.05, 3.0), (-5.0, -1e-6, 1.2), (-10.0, -1e-3, 3.0)])
 def test_weakly_delayed_loops_have_lamberts_root(now: float, late: float, delay_s: float, count: int) -> None:
-    # s = a + b e^{-s tau}: the first approximations are of no root
+    # s = a + b e^{-s tau}: the first approximations belong to no root
     scaled = late * delay_s * np.exp(-now * delay_s)
     rightmost = max((now + complex(lambertw(scaled, k)) / delay_s for k in (-1, 0)), key=lambda s: s.real)
     found = rightmost_roots([([[now]], 0.0), ([[late]], delay_s)], count)[0]

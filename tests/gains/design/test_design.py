@@ -1,4 +1,4 @@
-"""Designs and evaluations: what was asked for is there by independent analysis, and the report is complete."""
+"""Designs and evaluations: independent analyses find what was asked for, and the report is complete."""
 
 import json
 import re
@@ -95,13 +95,13 @@ def test_alpha_alone_gets_the_largest_margin() -> None:
     found = design(TRIANGLE, Requirement(alpha=0.8), period_s=PERIOD_S)
     # The search resolves α to 1e-9.
     assert 0.8 <= found.alpha <= 0.8 + 1e-8
-    # Slope of the trade-off about −1 per second: the margin at 0.8 comes after that at the larger α of 0.3 s.
+    # α falls by about 1 per second of margin, and at 0.3 s it is above 0.8.
     assert 0.30 < found.delay_margin_s < 0.32
     with pytest.raises(InfeasibleError):
         design(TRIANGLE, Requirement(alpha=0.8, delay_margin_s=found.delay_margin_s + 1e-6), period_s=PERIOD_S)
 
 
-def test_both_are_met_when_they_can_be() -> None:
+def test_alpha_and_margin_are_both_met_when_they_can_be() -> None:
     found = design(TRIANGLE, Requirement(alpha=0.7, delay_margin_s=0.3), period_s=PERIOD_S)
     assert found.delay_margin_s >= 0.3
     assert found.alpha > 0.8
@@ -157,7 +157,7 @@ def test_a_refusal_says_what_each_part_would_have_to_be(wanted: dict[str, Any]) 
     assert offers
     for name, most in offers:
         assert float(most) < wanted[name]
-        # what is offered can be had, and hardly more
+        # what is offered is feasible, and hardly more is
         relaxed: dict[str, Any] = wanted | {name: float(most)}
         design(TRIANGLE, Requirement(**relaxed), period_s=PERIOD_S)
         relaxed[name] *= 1.002
@@ -204,7 +204,7 @@ def test_gains_are_designed_for_the_command_fed_forward(share: float) -> None:
     loop = follower(ScalarGains(k1, k2, k3, 0.0), share)
     # 2e-3: the design takes the hold as half a period of delay
     assert max(loop(delay_s).string_peak for delay_s in (0.0, 0.15)) <= 1.0 + 2e-3
-    # no gain on the velocity in front is better within what may grow, tried one by one
+    # tried one by one, no other gain on the velocity in front has a larger α without growth
     tried = [
         robustness(-k1, other - share * k1, k3)
         for other in np.linspace(-2.0 * k1, 2.0 * k1, 81)

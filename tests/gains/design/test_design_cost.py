@@ -1,4 +1,4 @@
-"""The centralised LQR, a yardstick of decentralised designs, and the ratios of what designs cost."""
+"""The centralised LQR, a yardstick for decentralised designs, and the ratios of the designs' costs."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ _FITTING = "of shape .*: a symmetric, positive .*definite matrix of 3 rows is wa
         (np.full((3, 3), np.nan), "has entries that are not finite"),
     ],
 )
-def test_weights_that_are_not_wanted_are_refused(name: str, wrong: np.ndarray, wanted: str) -> None:
+def test_weights_of_the_wrong_form_are_refused_by_name(name: str, wrong: np.ndarray, wanted: str) -> None:
     plant = Plant(-np.eye(3), np.eye(3))
     weights = Weights(np.eye(3), np.eye(3))._replace(**{name: wrong})
     with pytest.raises(BadModelError, match=f"{name},? {wanted}"):

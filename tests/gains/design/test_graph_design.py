@@ -99,7 +99,7 @@ def test_what_cannot_be_had_together_is_named() -> None:
 
 
 def test_a_decay_that_the_sampled_loop_cannot_have_is_refused() -> None:
-    # a gain that decays like e^-500t at once, sampled 50 times a second: once handed out, with a margin of 0
+    # a gain that decays like e^-500t without hold, sampled 50 times a second, was once returned with a margin of 0
     with pytest.raises(InfeasibleError, match=r"decay_rate_1_s = 500\.0 with period_s = 0\.02.*: decay_rate_1_s = \d+"):
         design(CHAIN, Requirement(decay_rate_1_s=500.0), method="graph-lqr", period_s=0.02)
 
@@ -157,7 +157,7 @@ def test_design_file_gives_the_gains_that_a_scenario_takes() -> None:
         ),
     ],
 )
-def test_wrong_links_and_gains_are_one_line(before: str, after: str, message: str) -> None:
+def test_wrong_links_and_gains_are_refused_by_name(before: str, after: str, message: str) -> None:
     assert before in BIDIRECTIONAL
     with pytest.raises(ScenarioError, match=message):
         parse(BIDIRECTIONAL.replace(before, after), Path("bad.toml"))

@@ -69,9 +69,7 @@ def test_structured_optimum_is_stationary_stable_in_pattern_and_costs_more(patte
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_cost_gradient_is_its_slope_with_outputs_other_than_states(
-    seed: int,
-) -> None:
+def test_cost_gradient_is_its_slope_with_outputs_other_than_states(seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(5, 5)) - 6.0 * np.eye(5)
     plant = Plant(A, rng.normal(size=(5, 3)), rng.normal(size=(4, 5)))
@@ -95,10 +93,10 @@ def test_cost_gradient_is_its_slope_with_outputs_other_than_states(
         ((-1, 0, 0), [[1, 0, 1], [1, 0, 0], [0, 1, 0]]),
     ],
 )
-def test_vehicles_that_steer_each_other_only_are_stabilised(
+def test_vehicles_that_steer_only_each_other_are_stabilised(
     predecessors: tuple[int, ...], blocks: list[list[int]]
 ) -> None:
-    # three of the 1022 patterns of three vehicles; the gains grew until covariances overflowed
+    # three of the 1022 patterns of three vehicles, on which gains once grew until covariances overflowed
     formation = FormationModel(predecessors, axes=1)
     tree = leader_follower(formation)
     pattern = Pattern(np.array(blocks, dtype=bool), tree.input_sizes, tree.output_sizes)

@@ -74,7 +74,7 @@ def test_an_onboard_designs_certificate_proves_its_alpha_at_every_delay() -> Non
 
 @pytest.mark.parametrize("method", ["graph-lqr", "graph-dk"])
 def test_onboard_graph_gains_give_the_flown_loop_the_requested_margin(method: GraphMethod) -> None:
-    """That of own gains as if the station closed their loops, and that of the onboard loop; not of the ground loop."""
+    """The lesser of two margins: that of own loops if the station closed them, and that of the onboard loop."""
     chain, timing = FormationModel((-1, 0, 1)), OnboardTiming(0.02, steps=2)
     pattern = bidirectional(chain)
     on_board, on_ground = (
@@ -85,9 +85,9 @@ def test_onboard_graph_gains_give_the_flown_loop_the_requested_margin(method: Gr
     own_s = sampled_delay_margin(chain.A, chain.B, own_part(chain, on_board.K), period_s=0.02)
     assert min(margin_s, own_s) == pytest.approx(0.3, rel=2e-6)
     assert min(margin_s, own_s) >= 0.3
-    # in the ground loop they have less, which nobody flies
+    # in the ground loop, which is not flown, they have less
     assert on_board.delay_margin_s < 0.3 <= on_ground.delay_margin_s
-    # the delay just above destabilises the loop that limits, by the other way of the one-period map
+    # the delay just above destabilises the loop that limits, as the one-period map confirms
     if margin_s < own_s:
         assert onboard_loop(chain, on_board.K, timing).growth_1_s(1.001 * margin_s) > 0.0
     else:
@@ -97,8 +97,8 @@ def test_onboard_graph_gains_give_the_flown_loop_the_requested_margin(method: Gr
     assert on_board.certificate is not None
 
 
-def test_graph_gains_on_a_tree_are_bounded_alike_on_board() -> None:
-    """There the onboard loop takes every delay, and the ground loop's margin is that of the vehicles' own gains."""
+def test_graph_gains_on_a_tree_are_the_same_on_board() -> None:
+    """On a tree the onboard loop takes every delay, and the ground loop's margin is that of the vehicles' own gains."""
     chain, timing = FormationModel((-1, 0, 1)), OnboardTiming(0.02, steps=2)
     ground, onboard = (
         design(chain, Requirement(0.3), method="graph-lqr", period_s=0.02, onboard=where) for where in (None, timing)
@@ -117,7 +117,7 @@ def test_the_flown_loop_has_the_requested_decay_and_largest_margin() -> None:
     assert loop.sampled_margin_s() > 0.3
 
 
-def test_the_scenario_s_graph_design_is_that_of_its_loop() -> None:
+def test_a_scenarios_graph_design_is_that_of_its_loop() -> None:
     file = ROOT / "scenarios/chain3_bidirectional.toml"
     found, plan = flight_plan(with_loop(load(file), "onboard", file))
     assert found.delay_margin_s == pytest.approx(plan.delay_margin_s)

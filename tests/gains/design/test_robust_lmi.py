@@ -28,7 +28,7 @@ def test_lmi_gains_have_the_sources_pattern_with_k1_twice() -> None:
     (own, none, nothing), (front, spacing, own_again) = found.K.tolist()
     assert (none, nothing) == pytest.approx((0.0, 0.0), abs=1e-12)
     assert own == pytest.approx(own_again, rel=1e-12)
-    # of both vehicles as one formation, and of the subsystem that the source writes
+    # the closed loop of both vehicles as one formation is the subsystem that the source writes
     pair = FormationModel((-1, 0), axes=1)
     assert pytest.approx(subsystem_loop(own, front, spacing), abs=1e-9) == pair.A + pair.B @ found.K
 

@@ -117,7 +117,7 @@ def test_optimum_beats_a_plain_scan_at_most_by_its_grid(margin_s: float, coarse:
             A = np.array([[-k1, 0, 0], [1, 0, -1], [k2, k3, -k1]])
             M = 1j * omega[:, None, None] * np.eye(3) - A
             scanned = max(scanned, float(np.linalg.svd(M, compute_uv=False)[:, -1].min()))
-    # 0.01 in the angle, 5 % of k1 in k2 and 0.04 rad/s in ω: 2e-4 of α, either way (the ω grid flatters).
+    # 0.01 in the angle, 5 % of k1 in k2 and 0.04 rad/s in ω: 2e-4 of α, either way (the ω grid overestimates).
     assert best.alpha == pytest.approx(scanned, abs=5e-4)
     assert robustness(-best.k1, best.k2, best.k3) == pytest.approx(best.alpha, rel=1e-8)
 
@@ -128,11 +128,11 @@ def test_no_neighbour_with_the_margin_is_better(angle: float, front: float, peri
     best = largest_alpha(margin_s, period_s)
     assert best is not None
     k1, k3 = (float(k) for k in gains_of_margin(np.array(0.74 + angle), np.array(margin_s), period_s))
-    # 1e-8: what the last window of the search leaves open.
+    # 1e-8: the width of the last window of the search, in α.
     assert robustness(-k1, best.k2 + front * k1, k3) <= best.alpha + 1e-8
 
 
-def test_asking_for_margin_period_or_string_stability_costs_alpha() -> None:
+def test_more_margin_longer_periods_and_string_stability_cost_alpha() -> None:
     def alpha(margin_s: float, period_s: float, peak: float | None) -> float:
         gains = largest_alpha(margin_s, period_s, ChainLimit(peak))
         assert gains is not None

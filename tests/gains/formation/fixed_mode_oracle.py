@@ -20,7 +20,7 @@ from gains.core.structure import strongly_connected_blocks
 from gains.formation.fixed_modes import distinct_modes
 from gains.formation.pattern import Pattern, Plant
 
-# with up to this many inputs in one component all subsets are tried (256 ranks), with more Wolfe's algorithm
+# up to this many inputs in one component, all subsets are tried (256 ranks); beyond, Wolfe's algorithm is used
 _LARGEST_EXHAUSTIVE = 8
 # singular values below this share of the largest are zero: rounding is 1e-15, and what a gain moves is far larger
 _RANK_TOLERANCE = 1e-10

@@ -109,7 +109,7 @@ def test_every_link_is_in_exactly_one_subgraph(blocks: np.ndarray) -> None:
 
 
 def test_beyond_the_search_only_the_rank_proves_a_partition_smallest() -> None:
-    # every pair of eight outputs is used by one of 28 inputs: by output 8 subgraphs, which is the rank
+    # every pair of eight outputs is used by one of 28 inputs: one subgraph for each output makes 8, which is the rank
     pairs = np.zeros((28, 8), dtype=bool)
     for row, pair in enumerate(combinations(range(8), 2)):
         pairs[row, list(pair)] = True
@@ -117,7 +117,7 @@ def test_beyond_the_search_only_the_rank_proves_a_partition_smallest() -> None:
     assert size_and_rank(pattern_of(pairs)) == (8, 8)
     # 20 inputs that use everything but one of 20 outputs each: 20 again
     assert size_and_rank(pattern_of(~np.eye(20, dtype=bool))) == (20, 20)
-    # the overlap of two squares counts twice in the rank's sum of products, which a partition may not
+    # the overlap of two squares counts twice in the rank's sum of products, which a partition must not do
     overlap = np.kron(np.array([[1, 1, 0, 0], [1, 1, 1, 0], [0, 1, 1, 1], [0, 0, 1, 1]]), np.eye(5)) > 0
     overlap[:, 0] = True
     assert overlap.sum() > LARGEST_SEARCH_LINKS

@@ -1,4 +1,4 @@
-"""Fixed modes: what random gains do not move is what a rank says that no gain moves."""
+"""Fixed modes: those that random gains do not move are those that a rank test says no gain moves."""
 
 from itertools import combinations
 
@@ -39,7 +39,7 @@ def test_random_gains_and_ranks_agree_on_modes_of_random_plants() -> None:
 
 
 @pytest.mark.parametrize("missing", [1, 2])
-def test_they_agree_on_formations_that_lack_links(missing: int) -> None:
+def test_both_methods_agree_on_formations_that_lack_links(missing: int) -> None:
     formation = FormationModel((-1, 0, 1, 1))
     plant = formation_plant(formation)
     for pattern in (leader_follower(formation), bidirectional(formation)):
@@ -47,9 +47,9 @@ def test_they_agree_on_formations_that_lack_links(missing: int) -> None:
             agreed(plant, without_links(pattern, links))
 
 
-def test_they_agree_on_components_of_many_inputs() -> None:
-    # all pairs act on each other alike: differences of states stay where fewer than eleven feed themselves back, and
-    # twelve inputs are more than all subsets are tried of
+def test_both_methods_agree_on_components_of_many_inputs() -> None:
+    # all pairs act on each other alike: differences of states stay fixed where fewer than eleven feed themselves back;
+    # for twelve inputs not all subsets are tried
     plant = Plant(np.ones((12, 12)), np.eye(12))
     fed_back = (np.diag(np.arange(12) < count) for count in (9, 10, 11, 12))
     assert [agreed(plant, Pattern(blocks, (1,) * 12, (1,) * 12)) for blocks in fed_back] == [1, 1, 0, 0]

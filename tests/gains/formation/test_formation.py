@@ -104,7 +104,7 @@ def test_an_array_is_taken_as_well_as_a_tuple() -> None:
         ((-1.0, 0.5), "whole numbers"),
     ],
 )
-def test_what_is_no_tree_with_one_leader_is_refused(predecessors: tuple[int, ...], message: str) -> None:
+def test_predecessors_that_form_no_tree_are_refused(predecessors: tuple[int, ...], message: str) -> None:
     with pytest.raises(BadModelError, match=message):
         FormationModel(predecessors)
 
@@ -117,7 +117,7 @@ def test_what_is_no_tree_with_one_leader_is_refused(predecessors: tuple[int, ...
         ("x", "K2 has entries of type <U1; real numbers"),
     ],
 )
-def test_a_gain_of_another_kind_is_refused_by_name(gain: np.ndarray, message: str) -> None:
+def test_a_gain_of_the_wrong_form_is_refused_by_name(gain: np.ndarray, message: str) -> None:
     with pytest.raises(BadModelError, match=message):
         FormationModel((-1, 0)).overlapping_gain(-EYE, gain, EYE)
 

@@ -66,7 +66,7 @@ def test_every_condition_holds_for_any_tree(restriction: Literal["a", "b"], pred
 @settings(max_examples=15, deadline=None)
 @given(trees, st.floats(0.1, 2.0))
 def test_expanded_motion_contracts_to_the_original(predecessors: tuple[int, ...], time_s: float) -> None:
-    """U e^{A~ t} V = e^{A t}: the definition (3.5) that the conditions are there for, free and in closed loop."""
+    """U e^{A~ t} V = e^{A t}: the definition (3.5) that the conditions ensure, in open and in closed loop."""
     formation = FormationModel(predecessors)
     expansion = expand(formation)
     K_expanded = modified_gain(formation, expanded_gain(formation, *GAINS))
@@ -135,7 +135,7 @@ def test_wrong_map_is_refused_by_name() -> None:
 
 
 def test_two_hundred_vehicles_are_verified_with_sparse_matrices() -> None:
-    """A chain of 200: few entries a row, which is what makes it take milliseconds; dense it would hold a million."""
+    """A chain of 200: few entries a row, so it takes milliseconds; dense matrices would hold a million."""
     formation = FormationModel(tuple(range(-1, 199)))
     expansion = expand(formation)
     K_expanded = modified_gain(formation, expanded_gain(formation, *GAINS))

@@ -22,7 +22,7 @@ from gains.formation.pattern import (
 )
 from gains.sampled.onboard import own_part
 
-# The gains printed in chapter 5 of the source, with its slip in k33 ("0.5003") put right.
+# The gains printed in chapter 5 of the source, with the misprint in k33 ("0.5003") corrected.
 K11 = np.array([[-18.0874, 0.0005], [0.0005, -18.0874]])
 K12 = np.array([[-17.2478, -0.0013, 1.9965, -0.0013], [-0.0013, -17.2478, -0.0013, 1.9965]])
 K21 = np.array([[-6.0567, 0.0053], [0.0053, -6.0567]])
@@ -94,7 +94,7 @@ def test_a_gain_outside_the_pattern_is_refused_with_its_block() -> None:
         checked_pattern_gain(bidirectional(CHAIN), np.zeros((6, 9)))
 
 
-def test_what_does_not_fit_is_refused_by_name() -> None:
+def test_patterns_and_plants_that_do_not_fit_are_refused() -> None:
     with pytest.raises(BadModelError, match="entries other than 0 and 1"):
         Pattern(np.array([[1, 2]]), (1,), (1, 1))
     with pytest.raises(BadModelError, match=r"output_sizes = \(1,\) has 1 entries; 2"):

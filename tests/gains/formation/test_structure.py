@@ -1,4 +1,4 @@
-"""Splitting into strongly connected blocks, balancing, and taking equilibria out."""
+"""Splitting into strongly connected blocks, balancing, and removing equilibria."""
 
 import networkx as nx
 import numpy as np
@@ -74,7 +74,7 @@ def test_balancing_is_an_exact_similarity() -> None:
     # powers of two, the same for both matrices
     assert np.array_equal(ratio, B_balanced / B)
     assert np.array_equal(np.exp2(np.round(np.log2(ratio))), ratio)
-    # the rows spread over 11 decades before
+    # the rows spread over 11 decades before balancing
     norms = np.abs(A_balanced).sum(axis=1)
     assert norms.max() / norms.min() < 30.0
 
@@ -136,6 +136,6 @@ def test_matrices_without_equilibria_come_back_as_they_were() -> None:
 
 
 def test_integrator_that_nobody_feeds_back_stays() -> None:
-    # nothing is left of its block without it, and the loop is not stable with it
+    # without it nothing is left of its block; with it the loop is not stable
     _, gone = without_equilibria(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.zeros((2, 2)))
     assert gone == 0

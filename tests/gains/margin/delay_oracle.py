@@ -48,7 +48,7 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
     while True:
         reach = np.maximum(least[1:], least[:-1])
         coarse = np.flatnonzero(np.diff(omega) * lipschitz > rho * reach)
-        # far out M is jw plus something small, however much that turns
+        # far out M is jw plus something small, so these steps need no refining
         coarse = coarse[omega[coarse] < 4.0 * n * scale]
         if coarse.size == 0:
             break

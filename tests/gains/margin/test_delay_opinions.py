@@ -1,7 +1,7 @@
 """Random loops: three independent methods agree, the margin transforms as it must, and no lower bound is above it.
 
-`SLOW_TESTS=1 RANDOM_LOOPS=1000 python3 make.py test tests/gains/margin/test_delay_opinions.py` takes a thousand; 200
-are taken by default.
+`SLOW_TESTS=1 RANDOM_LOOPS=1000 python3 make.py test tests/gains/margin/test_delay_opinions.py` takes a thousand; the
+default is 200.
 """
 
 import os

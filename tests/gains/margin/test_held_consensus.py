@@ -1,4 +1,4 @@
-"""Held loops of many alike: of consensus the disagreement is judged, of equal followers one."""
+"""Held loops of many equal vehicles: consensus is judged by its disagreement, equal followers by one of them."""
 
 import json
 
@@ -25,7 +25,7 @@ def margin_of(plant: RealArray, entry: RealArray, gain: RealArray, period_s: flo
 
 
 def radius_on_disagreement(laplacian: FloatArray, delay_s: float) -> float:
-    """Of the lifted map on x orthogonal to (1, 1, 1), in coordinates that the product code does not use."""
+    """Spectral radius of the lifted map on x orthogonal to (1, 1, 1), in coordinates that `gains` does not use."""
     basis = np.array([[1.0, 1.0], [-1.0, 1.0], [0.0, -2.0]]) / np.sqrt([2.0, 6.0])
     late = -basis.T @ laplacian @ basis
     map_ = period_map(np.zeros((2, 2)), np.eye(2), late, period_s=PERIOD_S, delay_s=delay_s)
@@ -51,7 +51,7 @@ def test_period_of_held_consensus_ends_at_two_over_fastest_mode() -> None:
     assert found.roots_fixed_at_zero == 1
 
 
-def test_formation_of_double_integrators_loses_place_and_velocity() -> None:
+def test_held_formation_of_double_integrators_loses_position_and_velocity() -> None:
     plant, entry = np.kron(np.eye(3), [[0.0, 1.0], [0.0, 0.0]]), np.kron(np.eye(3), [[0.0], [1.0]])
     found = margin_of(plant, entry, np.kron(-COMPLETE, [[0.5, 1.0]]), PERIOD_S)
     alone = margin_of(plant[:2, :2], entry[:2, :1], np.array([[-1.0, -2.0]]), PERIOD_S)  # its one mode, lambda = 2
@@ -77,7 +77,7 @@ def test_equal_followers_have_the_error_and_frequency_of_one(period_s: float | N
     assert many.checked_by == one.checked_by
 
 
-def test_error_of_a_margin_of_too_large_maps_is_unknown() -> None:
+def test_a_margin_whose_maps_are_too_large_has_unknown_error() -> None:
     found = margin_of(np.zeros((1, 1)), np.eye(1), -np.eye(1), 0.004)  # pi / 2 s are 393 periods
     assert np.isnan(found.delay_margin_error_s)
     assert found.crossings == found.checked_by == ()

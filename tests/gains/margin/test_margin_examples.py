@@ -71,14 +71,14 @@ def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[li
     ("name", "interval"),
     [
         ("two_matrices", [0.10016826845243451, 1.7178581782970905]),
-        # the delay of the coupling has no part in it: each state is a loop of its own, the second with 2 tau
+        # the delay of the coupling does not matter: each state is a loop of its own, the second with 2 tau
         ("terms", [0.0, 6.172581371221286 / 2]),
         ("held", [0.0, 1.7294142794798775]),
         # from SciPy's matrix exponential over one period, bisected to its unit circle
         ("held_late", [0.0, 1.157157060376148]),
     ],
 )
-def test_model_files_in_docs_have_the_margins_known_of_them(tmp_path: Path, name: str, interval: list[float]) -> None:
+def test_model_files_in_docs_have_their_known_margins(tmp_path: Path, name: str, interval: list[float]) -> None:
     text = (ROOT / "docs" / "models" / f"{name}.json").read_text(encoding="utf-8")
     [found] = json.loads(run(tmp_path, text, "--json").stdout)["stable_intervals_s"]
     assert found == pytest.approx(interval, rel=1e-8)
@@ -112,7 +112,7 @@ def test_fixed_delays_give_the_rightmost_root(tmp_path: Path) -> None:
         ('{"terms": [{"A": [[1]], "delay": -0.1}]}', "delay"),
     ],
 )
-def test_bad_model_is_one_line_and_exit_code_2(tmp_path: Path, text: str, named: str) -> None:
+def test_a_bad_model_gives_one_line_and_exit_code_2(tmp_path: Path, text: str, named: str) -> None:
     done = run(tmp_path, text)
     assert done.returncode == 2
     assert done.stdout == ""

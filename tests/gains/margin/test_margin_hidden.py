@@ -1,6 +1,6 @@
 """Loops that margin tools get wrong, with answers known in closed form; and random loops on which three methods agree.
 
-The random part looks at a seeded sample. All thousand: MARGIN_SYSTEMS=1000 pytest
+The random part takes a seeded sample. All thousand: MARGIN_SYSTEMS=1000 pytest
 tests/gains/margin/test_margin_hidden.py -n auto
 """
 
@@ -30,7 +30,7 @@ GROUPS = max(20, SYSTEMS // 5)
 
 
 def result_of(A0: ArrayLike, A1: ArrayLike) -> dict[str, object]:
-    """What the command says of a pair, by way of its text."""
+    """The fields that `gcs margin` reports for a pair that it reads from JSON text."""
     text = f'{{"A0": {np.asarray(A0).tolist()}, "A1": {np.asarray(A1).tolist()}}}'
     return margin_fields(loop_margin(parse_model(text)))
 
@@ -90,7 +90,7 @@ def test_all_late_symmetric_block_takes_a_quarter_turn(size: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("size", [6, 14, 20])
-def test_many_scalar_loops_mixed_in_one_block(size: int, seed: int) -> None:
+def test_scalar_loops_mixed_in_one_block_have_their_least_margin(size: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = rng.uniform(-1.5, 0.5, size), rng.uniform(-3.0, -0.6, size)
     A0, A1 = rotated(np.diag(a), np.diag(b), seed=seed)
@@ -99,7 +99,7 @@ def test_many_scalar_loops_mixed_in_one_block(size: int, seed: int) -> None:
     assert delay_margin(A0, A1) == pytest.approx(expected, rel=1e-11)
 
 
-def test_singular_late_part_of_a_large_block() -> None:
+def test_a_late_part_of_rank_one_has_the_closed_form() -> None:
     # a chain of 11 lags and one integrator around which the feedback is late: rank one in 12 states;
     # k e^{-s tau} = s (s T + 1)^11 has its margin at the gain crossover in closed form once k is chosen for omega = 1
     lag_s, n = 0.02, 12
@@ -124,7 +124,7 @@ def test_consensus_has_the_margin_of_the_motion_that_decays(size: int) -> None:
 
 @pytest.mark.parametrize("decades", [6, 10])
 def test_unlike_units_are_no_equilibrium(decades: int) -> None:
-    # states in units that differ by up to twice as many decades: states were once taken out as standing still
+    # states in units that differ by up to twice as many decades: some states were once removed as equilibria
     rng = np.random.default_rng(8)
     free, A1 = rng.normal(size=(12, 12)), rng.normal(size=(12, 12))
     A0 = free - (np.linalg.eigvals(free + A1).real.max() + 0.3) * np.eye(12)
@@ -136,7 +136,7 @@ def test_unlike_units_are_no_equilibrium(decades: int) -> None:
 
 
 @pytest.mark.parametrize("slow", [1e-6, 1e-9, 1e-14])
-def test_slow_motion_within_the_block_of_a_fast_one(slow: float) -> None:
+def test_slow_motion_beside_a_fast_one_has_the_closed_form(slow: float) -> None:
     # s (s + 1e3) + slow e^{-s tau} (s + 1e3) - slow / 2: to first order in slow s = slow (5e-4 - e^{-s tau})
     result = result_of([[-1e3, 0.5], [slow, 0.0]], [[0.0, 0.0], [0.0, -slow]])
     expected = scalar_margin_s(5e-4 * slow, -slow)
@@ -160,7 +160,7 @@ def test_formation_at_constant_velocity_has_two_roots_at_zero() -> None:
     assert result["roots_fixed_at_zero"] == 2
 
 
-def test_a_zero_root_without_equilibrium_is_left_out_and_said() -> None:
+def test_a_zero_root_without_equilibrium_is_left_out_and_reported() -> None:
     # s + 1 - e^{-s tau}: A0 + A1 = 0 while neither vanishes; |s + 1| > 1 in the right half plane
     result = result_of([[-1.0]], [[1.0]])
     assert (result["stable_intervals_s"], result["roots_fixed_at_zero"]) == ([[0.0, None]], 1)
@@ -186,16 +186,16 @@ def test_defective_chain_has_the_margin_of_one_follower(followers: int) -> None:
 
 
 @pytest.mark.parametrize("size", [1, 3, 8])
-def test_edge_of_independence_has_no_limit(size: int) -> None:
-    # A0 = A1: s + a (1 + e^{-s tau}); A0 - A1 is singular, so a locus has modulus one at zero frequency, of which
-    # rounding once made a crossing at 1e16 s
+def test_a_loop_at_the_edge_of_independence_has_no_limit(size: int) -> None:
+    # A0 = A1: s + a (1 + e^{-s tau}); A0 - A1 is singular, so a locus has modulus one at zero frequency;
+    # rounding once turned this into a crossing at 1e16 s
     A0, A1 = rotated(-np.diag(np.linspace(0.3, 2.0, size)), -np.diag(np.linspace(0.3, 2.0, size)), seed=size)
     assert analyse_delay(A0, A1).delay_independent
     assert frequency_sweep_margin(A0, A1) == circle_sweep_margin([A0, A1]) == inf
 
 
 @pytest.mark.parametrize("slow", [1e-4, 1e-8, 1e-12])
-def test_fast_and_slow_motion_in_one_loop(slow: float) -> None:
+def test_fast_motion_beside_slow_motion_sets_the_margin(slow: float) -> None:
     # 1 / slow turns of the fast root in a turn of the slow one were once all listed, until memory was full
     A0, A1 = np.diag([0.0, 0.0]), -np.diag([slow, 100.0])
     assert analyse_delay(A0, A1).stable_intervals_s == ((0.0, pytest.approx(pi / 200.0, rel=1e-14)),)
@@ -203,8 +203,8 @@ def test_fast_and_slow_motion_in_one_loop(slow: float) -> None:
     assert delay_margin([[0.0]], [[-slow]]) == pytest.approx(pi / (2.0 * slow), rel=1e-14)
 
 
-def test_instability_that_a_delay_cures() -> None:
-    # s^2 - 0.1 s + 2 - e^{-s tau}: |(2 - w^2)^2 + 0.01 w^2| = 1; the pair comes out at the lower, goes in at the upper
+def test_a_delay_within_its_window_stabilises_an_unstable_loop() -> None:
+    # s^2 - 0.1 s + 2 - e^{-s tau}: |(2 - w^2)^2 + 0.01 w^2| = 1; the lower crossing stabilises, the upper does not
     A0, A1 = np.array([[0.0, 1.0], [-2.0, 0.1]]), np.array([[0.0, 0.0], [1.0, 0.0]])
     half = (4.0 - 0.01) / 2.0
     omega = sqrt(half - sqrt(half * half - 3.0)), sqrt(half + sqrt(half * half - 3.0))
@@ -253,7 +253,7 @@ def check_transformations(A0: Matrix, A1: Matrix, margin_s: float, seed: int) ->
 
 def check_lower_bounds(A0: Matrix, A1: Matrix, margin_s: float, seed: int) -> None:
     """Bounds for varying delays never exceed the exact margin; the more a delay may do, the lower they are."""
-    # a bisection ends at the exact margin where the bound is that good: no tolerance is needed
+    # bisections end at the exact margin at most: no tolerance is needed
     assert varying_delay_bound(A0, A1, rate=inf) <= margin_s
     if len(A0) > 3 or seed % 4 != 0:
         return
@@ -268,7 +268,7 @@ def check_lower_bounds(A0: Matrix, A1: Matrix, margin_s: float, seed: int) -> No
 
 
 @pytest.mark.parametrize("group", range(GROUPS))
-def test_random_loops(group: int) -> None:
+def test_three_methods_agree_on_random_loops(group: int) -> None:
     verdicts: list[float] = []
     for seed in range(group, SYSTEMS, GROUPS):
         A0, A1 = random_loop(seed)

@@ -1,7 +1,7 @@
 """`gcs margin` against an oracle that counts roots by the argument principle: families that broke it, and random loops.
 
-A seeded sample by default; MARGIN_ORACLE=420 python3 make.py test tests/gains/margin/test_margin_oracle.py takes as
-many of each.
+The default is a seeded sample; MARGIN_ORACLE=420 python3 make.py test tests/gains/margin/test_margin_oracle.py takes
+420 of each.
 """
 
 import json
@@ -23,7 +23,7 @@ from tests.gains.margin.delay_oracle import TooCloseError, unstable_roots
 Matrix = NDArray[np.float64]
 SYSTEMS = int(os.environ.get("MARGIN_ORACLE", "24"))
 GROUPS = 6
-# the spectrum is looked at this far beside a critical delay
+# the roots are counted this far beside a critical delay, relative to it
 BESIDE = 2e-3
 
 
@@ -38,7 +38,7 @@ def modelled(terms: Sequence[tuple[NDArray[Any], object]]) -> dict[str, Any]:
 
 
 def check_windows(model: dict[str, Any]) -> int:
-    """Compare the windows with the oracle beside their ends and between; how many delays could be looked at."""
+    """Compare the windows with the oracle beside their ends and between; returns at how many delays it could decide."""
     found, parsed = analysed(model), parse_model(json.dumps(model))
     assert isinstance(parsed, DelayModel)
     ends = [end for window in found.stable_intervals_s[:2] for end in window if 0.0 < end < 20.0]
@@ -81,7 +81,7 @@ def integrators(seed: int) -> dict[str, Any]:
 
 
 def consensus(seed: int) -> dict[str, Any]:
-    """Agents of which some terms act at once and some late: one root stays at zero, nothing stands still."""
+    """Agents of which some terms act at once and some late: one root stays at zero, but there is no equilibrium."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 6))
     weights = rng.uniform(0.1, 2.0, (n, n)) * (1.0 - np.eye(n))
@@ -135,7 +135,7 @@ def test_double_integrator_in_position_and_position_plus_velocity() -> None:
 def test_integrators_in_any_unimodular_coordinates_have_a_margin(group: int) -> None:
     for seed in range(group, 420, GROUPS):
         found = analysed(integrators(seed))
-        # the poles without delay are at -1 to -3; the known delay of every third loop may be too much for it
+        # the poles without delay are at -1 to -3; the known delay of every third loop may exceed the margin
         assert found.delay_margin_s > 0.0 or seed % 3 == 2, seed
 
 
@@ -149,7 +149,7 @@ def test_windows_are_those_of_the_argument_principle(family: Any, group: int) ->
 
 
 @pytest.mark.parametrize("group", range(GROUPS))
-def test_no_digit_is_printed_that_is_not_known(group: int) -> None:
+def test_every_printed_digit_of_a_margin_is_known(group: int) -> None:
     for seed in range(group, 2 * SYSTEMS, GROUPS):
         A0, A1, margin_s = hidden_followers(seed)
         try:
@@ -174,7 +174,7 @@ def test_four_followers_in_dense_coordinates_keep_a_few_digits() -> None:
 
 
 @pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_a_held_loop_has_its_one_period_maps_margin(seed: int) -> None:
+def test_a_held_loop_has_the_margin_of_its_period_map(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, inputs, period_s = int(rng.integers(1, 4)), int(rng.integers(1, 3)), float(rng.uniform(0.02, 0.3))
     free, B, K = rng.normal(size=(n, n)), rng.normal(size=(n, inputs)), rng.normal(size=(inputs, n))

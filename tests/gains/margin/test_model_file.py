@@ -1,4 +1,4 @@
-"""The JSON model of `gcs margin`: what it means, and one line for everything that is wrong with it."""
+"""The JSON model of `gcs margin`: what it means, and that any mistake in it is named in one line."""
 
 import json
 from fractions import Fraction

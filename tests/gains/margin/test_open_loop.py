@@ -61,7 +61,7 @@ def test_several_inputs_and_outputs_are_closed_together() -> None:
         (np.eye(2), "read an object of type ndarray; a system with A, B, C, D or with num, den"),
     ],
 )
-def test_what_is_no_loop_with_delay_is_refused(system: object, said: str) -> None:
+def test_systems_that_form_no_loop_with_delay_are_refused(system: object, said: str) -> None:
     with pytest.raises(BadModelError, match=said):
         delayed_feedback(system)
 
@@ -86,6 +86,6 @@ def test_model_and_matlab_files_hold_the_same_systems(tmp_path: Path, keys: str)
         ('{"A": [[1]], "B": [[1]], "C": [[1]], "D": [[1]]}', "D is not zero"),
     ],
 )
-def test_a_wrong_system_in_a_file_is_one_line(text: str, said: str) -> None:
+def test_a_wrong_system_in_a_file_is_refused_by_name(text: str, said: str) -> None:
     with pytest.raises(BadModelError, match=said):
         parse_model(text)

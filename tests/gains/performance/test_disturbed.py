@@ -23,12 +23,12 @@ OLDER = np.array([[[0, 0, 0], [0.3, 0, 0], [0.1, 0.45, 0]], [[0, 0, 0], [0.25, 0
 
 
 def spread_by_frequency(flown: DisturbedFormation) -> FloatArray:
-    """Standard deviations of the errors, true and reported: spectra of each source, integrated, without F and P."""
+    """Standard deviations of the errors, true and reported: the spectra of all sources, integrated, without F and P."""
     model, gusts, sensing, T = flown.model, flown.gusts, flown.sensing, flown.period_s
     assert gusts is not None
     n, states = len(flown.A), model.states
     entry = np.vstack([model.B, np.zeros((n - states, model.inputs))])
-    if n > states:  # of a vehicle's acceleration and of the velocity that it owes, the second falls as it is pushed
+    if n > states:  # of a vehicle's two states, acceleration and velocity still to be reached, a push lowers the second
         entry[states + 1 :: 2] = -np.eye(model.vehicles)
     if gusts.common:
         entry = entry @ np.ones((model.inputs, 1))
@@ -138,7 +138,7 @@ def test_a_loop_past_its_margin_has_no_spread() -> None:
         flown.spread()
 
 
-def test_prediction_lessens_what_noise_does_at_a_long_delay() -> None:
+def test_prediction_reduces_the_effect_of_noise_at_long_delays() -> None:
     without, predicted = (
         DisturbedFormation(CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, 0.25, sensing=EVERYTHING, assumed_s=assumed_s).spread()
         for assumed_s in (None, 0.25)

@@ -46,7 +46,7 @@ def sampled_growth(flight: FlownFormation, disturbance: FloatArray, delay_s: flo
 
 
 def worst_disturbance(flight: FlownFormation, delay_s: float) -> FloatArray:
-    """A real one of norm 1 on north and east that is worst at the frequency of least σ_min, on a plain grid."""
+    """The real disturbance of norm 1 on north and east that is worst at the frequency of least σ_min on a grid."""
     omega = np.linspace(0.0, 12.0, 6001)
     left, sigma, right = np.linalg.svd(flight.characteristic(omega, delay_s))
     at = int(np.argmin(sigma[:, -1]))
@@ -99,7 +99,7 @@ def test_a_leader_with_one_follower_is_the_followers_loop() -> None:
                 assert matrix.alpha(delay_s) == pytest.approx(pair_of_one_axis.alpha(delay_s), rel=1e-9)
 
 
-def test_only_gains_that_couple_north_and_east_are_taken_whole() -> None:
+def test_only_gains_that_couple_axes_need_the_whole_matrix() -> None:
     flight = flown("ground")
     omega = np.linspace(0.0, 5.0, 20)
     assert flight.characteristic(omega, 0.1).shape == (20, 5, 5)

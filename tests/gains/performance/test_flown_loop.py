@@ -20,7 +20,7 @@ from gains.sampled.multirate import Timing
 
 PERIOD_S = 0.02
 GAINS = ScalarGains(3.4079559741115664, 0.6308727089934395, 5.608081773264997, 0.8168)
-"""Those of triangle5."""
+"""The gains of triangle5."""
 FLOWN = FlownLoop(GAINS, FlownTiming(delay_margin_s=0.3, period_s=PERIOD_S))
 
 
@@ -65,9 +65,7 @@ def test_alpha_and_growth_of_triangle5_degrade_well_before_the_margin(
 
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.2, 0.25])
-def test_only_a_real_disturbance_beyond_alpha_destabilises_the_sampled_loop(
-    delay_s: float,
-) -> None:
+def test_only_a_real_disturbance_beyond_alpha_destabilises_the_sampled_loop(delay_s: float) -> None:
     pair = FormationModel((-1, 0))
     K = pair.overlapping_gain(-GAINS.k1 * np.eye(2), GAINS.k2 * np.eye(2), GAINS.k3 * np.eye(2))
     A0, A1 = subsystem(GAINS, 1)
@@ -100,11 +98,11 @@ def test_the_peak_is_the_sampled_chains_growth_between_vehicles(delay_s: float) 
     K = chain.overlapping_gain([[-GAINS.k1]], [[GAINS.k2]], [[GAINS.k3]])
     lifted = period_map(chain.A, chain.B, K, period_s=PERIOD_S, delay_s=delay_s)
     entry = np.zeros(len(lifted))
-    entry[0], entry[1] = PERIOD_S, PERIOD_S**2 / 2.0  # of a held acceleration of the leader
+    entry[0], entry[1] = PERIOD_S, PERIOD_S**2 / 2.0  # a held acceleration of the leader
     z = np.exp(1j * np.linspace(0.01, 12.0, 6000) * PERIOD_S)
     response = np.linalg.solve(z[:, None, None] * np.eye(len(lifted)) - lifted, entry[:, None])[..., 0]
     growth = np.abs(response[:, 4] / response[:, 2])  # velocity errors of the second and the first follower
-    # the second order of the hold moves the margin by 1e-5 s, and near it the peak by as much as it is near
+    # the second order of the hold moves the margin by 1e-5 s, which moves the peak more, the nearer it is
     assert FLOWN.string_peak(delay_s) == pytest.approx(
         max(1.0, float(growth.max())), rel=2e-2 if delay_s > 0.26 else 4e-3
     )
@@ -123,7 +121,7 @@ def gains_of_stable_loops() -> st.SearchStrategy[ScalarGains]:
 )
 @example(gains=GAINS, loop="ground", peak=1.0)
 @example(gains=GAINS, loop="onboard", peak=1.05)
-def test_the_closed_form_limit_is_where_the_peak_passes_it(gains: ScalarGains, loop: str, peak: float) -> None:
+def test_the_closed_form_limit_is_where_growth_exceeds_the_peak(gains: ScalarGains, loop: str, peak: float) -> None:
     pair = FormationModel((-1, 0), axes=1)
     K = pair.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
     margin_s = sampled_delay_margin(pair.A, pair.B, K, period_s=PERIOD_S) if loop == "ground" else inf
@@ -232,5 +230,5 @@ def test_a_root_on_the_axis_appears_where_alpha_ends() -> None:
     flown = FlownLoop(GAINS, FlownTiming(margin_s, 0.0))
     near = flown.pair.alpha(margin_s * (1 - 1e-4))
     root = rightmost_root([(A0, 0.0), (A1, margin_s * (1 - 1e-4))])
-    # α is the distance of a root to the axis over its condition number at most
+    # α is at most the distance of a root to the axis over its condition number
     assert 0.0 < near <= -root.real

@@ -22,7 +22,7 @@ def test_frequency_sweep_and_spectral_radius_give_one_margin(response: Response,
     K = PAIR.overlapping_gain([[-k1]], [[k2]], [[k3]])
     swept = min(lone_margin(k1, gain, response, period_s=period_s) for gain in (0.0, k3))
     spectral = sampled_margin(PAIR, K, [response] * 2, timing=Timing(period_s, period_s))
-    # the order of a dead time at the high frequencies of steps: 5e-5 s at 0.2 s of it
+    # the approximation of a dead time at the high frequencies of steps: 5e-5 s for 0.2 s of it
     assert swept == pytest.approx(spectral, abs=6e-5)
 
 

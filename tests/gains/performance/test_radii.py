@@ -1,4 +1,4 @@
-"""Stability radii: the disturbance of that size is confirmed by eigenvalues, and no smaller one is found."""
+"""Stability radii: eigenvalues confirm a disturbance of that size, and no smaller one is found."""
 
 from typing import Any
 
@@ -74,7 +74,7 @@ def test_no_constant_disturbance_below_the_real_radius_is_found() -> None:
     loop, rng = sector(0.2, 2, PAIR), np.random.default_rng(1)
     size = 0.995 * loop.real_radius().radius_1_s
     growths: list[float] = []
-    for _ in range(3):  # uphill from anywhere
+    for _ in range(3):  # uphill from random starts
         x, best = rng.normal(size=(3, 3)), -np.inf
         for _ in range(300):
             trial = x + rng.normal(size=(3, 3)) * 0.15

@@ -29,7 +29,7 @@ def test_peak_without_delay_is_the_closed_form() -> None:
     assert peak_of(1.0, 1.0, 1.0) == pytest.approx(sqrt((1.0 + w) / (1.0 - w + w * w)), rel=1e-13)
 
 
-def test_velocity_against_the_formations_own_makes_the_chain_string_stable() -> None:
+def test_without_front_velocity_strong_damping_makes_the_chain_string_stable() -> None:
     # k2^2 + 2 k3 <= k1^2
     assert peak_of(2.0, 0.0, 1.0) == 1.0
     # k1^2 a hundredth short of 2 k3: |1 / (s^2 + k1 s + 1)| peaks at 1 / (k1 sqrt(1 - k1^2 / 4)), a little above one

@@ -38,7 +38,7 @@ def test_vehicles_that_act_on_each_other_are_one_block() -> None:
     assert [block.system_ids for block in blocks] == [(7,), (8, 9)]
 
 
-def test_blocks_of_responding_vehicles_have_the_margin_of_the_whole() -> None:
+def test_blocks_of_responding_vehicles_have_the_margin_of_the_formation() -> None:
     model, timing = FormationModel((-1, 0, 1)), Timing(0.02, 0.02)
     K = model.overlapping_gain(-1.778 * np.eye(2), 0.549 * np.eye(2), 1.43 * np.eye(2))
     responses = [Response(0.125, 2.78), Response(0.066, 1.88, 0.048), Response(0.11, 1.71, 0.0, 14.0)]
@@ -53,7 +53,7 @@ def test_blocks_of_responding_vehicles_have_the_margin_of_the_whole() -> None:
 
 
 def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
-    """Margins of the continuous blocks in closed form; a period T takes half of itself away."""
+    """Margins of the continuous blocks in closed form; a period T reduces them by T / 2."""
     period_s = 1e-3
     leader, follower = first_of_each_kind(tree_blocks(period_s))
     omega = sqrt((K1**2 + sqrt(K1**4 + 4.0 * K3**2)) / 2.0)
@@ -74,7 +74,7 @@ def test_the_critical_block_grows_most_at_its_own_delay() -> None:
 
 @pytest.mark.parametrize("whole", [False, True])
 def test_positions_instead_of_errors_leave_the_growth_as_it_is(whole: bool) -> None:
-    """With and without the leader in the loop; vehicles respond each in its own way, all states have one age."""
+    """With and without the leader in the loop; each vehicle responds in its own way, and all states have one age."""
     model = FormationModel((-1, 0, 1))
     K = model.overlapping_gain(-1.778 * np.eye(2), 0.549 * np.eye(2), 1.43 * np.eye(2))
     K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)

@@ -1,7 +1,7 @@
 """Mismatch windows against the spectrum of the lifted map at hundreds of delays.
 
-Random loops, 24 by default; MISMATCH_LOOPS=1200 python3 make.py test tests/gains/sampled/test_mismatch_windows.py takes
-as many.
+By default 24 random loops; MISMATCH_LOOPS=1200 python3 make.py test tests/gains/sampled/test_mismatch_windows.py takes
+1200.
 """
 
 import os
@@ -26,7 +26,7 @@ def first_order(a: float, b: float, k: float) -> Loop:
 
 
 def on_each_axis(A: list[list[float]], B: list[list[float]], gain: FloatArray) -> Loop:
-    """In as many axes as the gain has rows."""
+    """The plant in as many axes as the gain has rows."""
     axes = np.eye(len(gain))
     return np.kron(axes, A).astype(np.float64), np.kron(axes, B).astype(np.float64), gain
 
@@ -54,7 +54,7 @@ def random_plant(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 def random_loop(rng: np.random.Generator) -> Loop:
-    """With the LQR gain of random weights, weaker or stronger than it, and at times disturbed."""
+    """A plant with the LQR gain of random weights, made weaker or stronger, and at times disturbed."""
     A, B = random_plant(rng)
     root = rng.normal(size=A.shape)
     weight = 10.0 ** rng.uniform(-1.0, 1.0) * np.eye(B.shape[1])

@@ -47,7 +47,8 @@ def flown(
 ) -> tuple[Matrix, float]:
     """States at multiples of the common period, and the mean loop delay of commands that are the first from a sample.
 
-    Samples, messages and commands as a list of events in time: nothing of the map's. Before zero nothing was ever sent.
+    Samples, messages and commands are a list of events in time, without any matrix of the map. Nothing is sent before
+    zero.
     """
     _, B, K = loop
     events: list[tuple[float, int, str]] = []
@@ -152,7 +153,7 @@ def test_growth_is_zero_at_the_margin_and_negative_before(timing: Timing) -> Non
     ("rates_hz", "gains", "crossings_s"),
     [((9, 4), (2.729, -2.871), (0.27286, 0.28840, 0.30606)), ((9, 7), (3.871, -2.8508), (0.29677, 0.30148, 0.30466))],
 )
-def test_the_first_of_several_crossings_within_one_look_counts(
+def test_the_first_of_several_crossings_within_one_step_counts(
     rates_hz: tuple[int, int], gains: tuple[float, float], crossings_s: tuple[float, float, float]
 ) -> None:
     loop, timing = (*FOLLOWER[:2], np.array([gains])), Timing(1.0 / rates_hz[0], 1.0 / rates_hz[1])
@@ -166,15 +167,15 @@ def test_the_first_of_several_crossings_within_one_look_counts(
         assert (late > early) == (k % 2 == 1)
 
 
-def test_the_mean_loop_delay_hides_almost_nothing_of_the_rates() -> None:
-    """The margin of uneven rates is that of the slower one to its second order; the least delay would be 4 ms off."""
+def test_at_the_mean_loop_delay_uneven_rates_hardly_matter() -> None:
+    """To second order the margin of uneven rates is that of the slower one; by the least delay it would be 4 ms off."""
     for telemetry_s in (0.045, 0.04, 0.03, 0.0333):
         even_s = multirate_delay_margin(*FOLLOWER, Timing(0.05, 0.05))
         assert multirate_delay_margin(*FOLLOWER, Timing(0.05, telemetry_s)) == pytest.approx(even_s, abs=3e-4)
 
 
 def test_long_margins_are_those_of_the_mean_loop_delay() -> None:
-    """A part in 10^4 is left to the order of the loop delays; at 100,000 periods the map of a search has no end."""
+    """The order of the loop delays accounts for a part in 10^4; at 100,000 periods a map would be far too large."""
     timing = Timing(1.0 / 59.91, 1.0 / 124.5)
     margin_s = multirate_delay_margin(*FOLLOWER, timing)
     assert margin_s > 30.0 * timing.held_s

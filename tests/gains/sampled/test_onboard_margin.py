@@ -28,7 +28,7 @@ PRINTED = np.array(
 
 
 def marched(loop: OnboardLoop, delay_s: float, *, periods: int) -> FloatArray:
-    """The state (periods, n) at every beginning of a period, marched instant by instant: nothing of the map's."""
+    """The state (periods, n) at every beginning of a period, marched instant by instant, without the map."""
     timing = loop.timing
     n, step_s = len(loop.A), timing.control_s / timing.steps
     x = np.arange(1.0, n + 1.0)
@@ -66,7 +66,7 @@ def test_printed_gains_have_the_erratums_continuous_margin_in_two_ways() -> None
     loop = onboard_loop(CHAIN, PRINTED, FINE)
     own = own_part(CHAIN, PRINTED)
     others = PRINTED - own
-    assert loop.continuous_margin_s() == pytest.approx(1.00796, rel=1e-3)  # which is with the off-diagonal entries
+    assert loop.continuous_margin_s() == pytest.approx(1.00796, rel=1e-3)  # computed with the off-diagonal entries
     assert frequency_sweep_margin(CHAIN.A + CHAIN.B @ own, CHAIN.B @ others) == pytest.approx(
         loop.continuous_margin_s(), rel=1e-9
     )
@@ -74,7 +74,7 @@ def test_printed_gains_have_the_erratums_continuous_margin_in_two_ways() -> None
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.04, 0.17, 0.9071])
 @pytest.mark.parametrize("timing", [FINE, OnboardTiming(0.04, 4, 2), OnboardTiming(0.1, 5, 5), OnboardTiming(0.03, 1)])
-def test_map_is_a_march_event_by_event(timing: OnboardTiming, delay_s: float) -> None:
+def test_the_map_agrees_with_a_march_event_by_event(timing: OnboardTiming, delay_s: float) -> None:
     loop = onboard_loop(CHAIN, PRINTED, timing)
     states = marched(loop, delay_s, periods=60)
     step = lifted_map(local_plant((loop.A, loop.sensed, loop.known, loop.late), timing), delay_s)
@@ -116,14 +116,14 @@ def test_sampled_margin_goes_to_the_continuous_one_with_the_period() -> None:
     assert fine.sampled_margin_s() == pytest.approx(fine.continuous_margin_s(), rel=1e-4)
 
 
-def test_own_steps_make_an_infinitely_fast_vehicle_a_continuous_loop() -> None:
+def test_many_own_steps_make_the_local_loop_continuous() -> None:
     """With many steps the local loop is the matrix exponential of A + B K_own, and what is late a held command."""
     loop = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.02, steps=400))
     held = growth_rate(loop.A + loop.sensed + loop.known, loop.late, np.eye(5), period_s=0.02, delay_s=0.9)
     assert loop.growth_1_s(0.9) == pytest.approx(held, abs=1e-4)
 
 
-def test_without_own_terms_it_is_the_ground_loop() -> None:
+def test_an_onboard_loop_without_own_terms_is_the_ground_loop() -> None:
     """Gains that vehicles have on each other's errors only: nothing is fed back on board, all is late."""
     K = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
     pair = FormationModel((-1, 0), axes=1)

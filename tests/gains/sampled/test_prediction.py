@@ -86,8 +86,8 @@ def flown_growth(
     """Growth rate (1/s) of a flight of double integrators of one axis, event by event: no matrix of the loop.
 
     Each vehicle's position and velocity are integrated in closed form between the instants at which its commands act.
-    The station carries each vehicle's newest sample on under the commands that it has sent to that vehicle, to the
-    instant at which its own new command to the vehicle i, delayed by `assumed_s[i]`, acts.
+    The station predicts each vehicle from its newest sample under the commands sent to it, up to the instant at which
+    the new command to vehicle i, delayed by `assumed_s[i]`, acts.
     """
     rng = np.random.default_rng(3)
     vehicles, ticks = model.vehicles, round(duration_s / PERIOD_S)
@@ -273,7 +273,7 @@ def test_a_modelled_lag_leaves_the_published_window_and_decay() -> None:
     assert predicted_growth_rate(*loop, RATES, assumed_s=1.5, delay_s=1.5) == pytest.approx(-1.66, abs=5e-3)
     for believed_s in (0.10, 0.15, 0.20):
         assert believed_radius(loop, follower(lag_s=believed_s)) < 1.0
-    # believing that there is none is not
+    # a prediction that assumes no lag is unstable
     none = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.array([[0.0], [1.0], [0.0]]), loop[2]
     assert believed_radius(loop, none) > 1.0
 
@@ -379,8 +379,8 @@ def test_the_whole_formation_is_stable_exactly_where_each_vehicle_is() -> None:
             assert (largest < 1.0) == is_stable
 
 
-def test_vehicles_with_delays_of_their_own_stay_block_triangular() -> None:
-    """Of three vehicles only the one whose delay leaves its own window makes the flight grow."""
+def test_a_delay_outside_one_vehicles_window_makes_errors_grow() -> None:
+    """Three vehicles, each with its own delay: the flight grows once one of these leaves its window."""
     model = FormationModel((-1, 0, 1), axes=1)
     K = model.overlapping_gain([[-K1]], [[0.63]], [[K3]])
     assumed_s = [0.31, 0.6, 0.853]
@@ -406,7 +406,7 @@ def test_a_formation_of_lagging_vehicles_has_its_blocks_window() -> None:
     )
 
 
-def test_what_is_not_an_assumption_is_refused() -> None:
+def test_an_assumed_delay_that_is_no_delay_is_refused() -> None:
     for assumed_s in (-0.1, inf, float("nan")):
         with pytest.raises(BadModelError, match="assumed_s"):
             mismatch_window(*follower(), RATES, assumed_s=assumed_s)

@@ -1,4 +1,4 @@
-"""The one-period map against a simulation that knows nothing of it, and against SciPy."""
+"""The one-period map against a simulation that does not use it, and against SciPy."""
 
 import numpy as np
 import pytest

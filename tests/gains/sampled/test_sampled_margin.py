@@ -150,12 +150,12 @@ def test_equal_followers_in_mixed_coordinates_have_the_margin_of_one(vehicles: i
             1.6169892858332227,
             1.99941448,
         ),
-        # the delay a crossing belongs to changes by a third of a period within a sixteenth of one
+        # the delay of a crossing changes by a third of a period within a sixteenth of one
         ((np.array([[-1.461614]]), np.array([[1.0]]), np.array([[-2.65328026]])), 0.5808172169479804, 0.97469014),
     ],
     ids=["short window", "steep"],
 )
-def test_loops_near_their_period_limit_that_were_once_missed(
+def test_crossings_near_the_period_limit_once_missed_are_found(
     loop: Loop, period_s: float, expected_periods: float
 ) -> None:
     margin_s = sampled_delay_margin(*loop, period_s=period_s)
@@ -195,7 +195,7 @@ def test_period_limit_of_a_follower_is_the_closed_form() -> None:
 
 @pytest.mark.parametrize("angle", np.linspace(0.1, 1.5, 15))
 def test_period_limit_of_a_follower_is_unchanged_in_turned_coordinates(angle: float) -> None:
-    # rounding makes of two integrators a motion that is too slow to be seen within 1e16 s
+    # rounding turns two integrators into a motion too slow to be seen within 1e16 s
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     A, B, K = FOLLOWER
     assert analyse_period(turn @ A @ turn.T, turn @ B, K @ turn.T).limit_s == pytest.approx(2.0, rel=1e-10)
@@ -203,7 +203,7 @@ def test_period_limit_of_a_follower_is_unchanged_in_turned_coordinates(angle: fl
 
 @pytest.mark.parametrize(("a", "b", "error"), [(3.0, 100.0, 1e-3), (20.0, 100.0, 0.1)])
 def test_period_limit_of_mixed_states_is_right_to_their_rounding(a: float, b: float, error: float) -> None:
-    """All entries are exact, up to 4e6: the limit is 2 s over the gain. Periods of 1e-11 s were taken as unstable."""
+    """All entries are exact, up to 4e6: the limit is 2 s over the gain. Also 1e-11 s once counted as unstable."""
     mix, back = np.array([[1.0, a], [b, 1.0 + a * b]]), np.array([[1.0 + a * b, -a], [-b, 1.0]])
     gain = 1.0 + 2.0**-10
     A, B = back @ np.array([[0.0, 1.0], [0.0, 0.0]]) @ mix, back @ np.array([[0.0], [1.0]])

@@ -1,4 +1,4 @@
-"""Set-points that act early or late in a predicted loop: proved spreads against simulations that do their worst."""
+"""Set-points that act early or late in a loop with prediction: proved spreads against adverse simulations."""
 
 from functools import cache
 
@@ -72,7 +72,7 @@ def deviations(rng: np.random.Generator, most_s: float) -> FloatArray:
 
 
 def in_order(late_s: FloatArray) -> FloatArray:
-    """The same where none overtakes another: a link that keeps the order delays the later ones more."""
+    """The same without overtaking: a link that keeps the order delays the later ones more."""
     return np.maximum.accumulate(DUE_S + late_s) - DUE_S
 
 
@@ -94,7 +94,7 @@ def test_no_jumping_within_the_bound_makes_errors_grow(assumed_s: float) -> None
 
 
 def test_some_jumping_a_quarter_beyond_makes_errors_grow() -> None:
-    """So the bound without jitter of telemetry is at most a quarter too small, and the simulation can tell."""
+    """So without telemetry jitter the bound is at most a quarter too small, and the simulation can tell."""
     rng, bound_s = np.random.default_rng(1), spread(0.6).bound_s(mean_s=0.6)
     ages_s = np.full(TICKS, UP_S)
     found = [flown(0.6, UP_S, in_order(deviations(rng, 1.25 * bound_s)), ages_s) for _ in range(25)]
@@ -120,7 +120,7 @@ def test_with_jittery_ages_the_bound_is_cautious() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_pulses_within_windows_have_at_most_the_gain_counted_on(seed: int) -> None:
-    """The norm of the matrix c_kj itself, of pulses and windows in order that are drawn."""
+    """The norm of the matrix c_kj itself, for random pulses and windows in order."""
     rng = np.random.default_rng(seed)
     early_s, late_s, windows = *(PERIOD_S * rng.uniform(0.0, 3.0, 2)).tolist(), int(rng.integers(1, 4))
     due_s = np.arange(80) * PERIOD_S
@@ -132,7 +132,7 @@ def test_pulses_within_windows_have_at_most_the_gain_counted_on(seed: int) -> No
     assert 0.0 < largest_s <= _gain(early_s, late_s, PERIOD_S, windows) * (1.0 + 1e-12)
 
 
-def test_the_bound_is_nothing_at_both_ends_of_the_window() -> None:
+def test_the_bound_vanishes_at_both_ends_of_the_window() -> None:
     ends_s = mismatch_window(*FOLLOWER, TIMING, assumed_s=0.6)
     for end_s in ends_s:
         shares = [spread(0.6).bound_s(mean_s=0.6 + share * (end_s - 0.6)) for share in (0.0, 0.5, 0.9, 0.99, 1.01)]
@@ -144,7 +144,7 @@ def test_the_bound_is_nothing_at_both_ends_of_the_window() -> None:
             assert bound_s <= (1.0 - share) * abs(end_s - 0.6)
 
 
-def test_without_sampling_it_is_the_gain_of_the_continuous_loop() -> None:
+def test_without_sampling_the_bound_is_the_continuous_loops_gain() -> None:
     """1 / max |s K (s I - A - B K)^{-1} e^{A tau^} B|, written out for a double integrator."""
     s = 1j * np.logspace(-3.0, 3.0, 100_001)
     for assumed_s in (0.3, 1.0):
@@ -154,7 +154,7 @@ def test_without_sampling_it_is_the_gain_of_the_continuous_loop() -> None:
         assert fine.bound_s(mean_s=assumed_s) == pytest.approx(1.0 / largest, rel=5e-3)
 
 
-def test_over_a_short_delay_nothing_is_too_late() -> None:
+def test_over_a_short_delay_the_bound_is_the_delay() -> None:
     assert spread(0.06).bound_s(mean_s=0.06) == 0.06
 
 
@@ -192,6 +192,6 @@ def test_an_unstable_loop_has_no_bound() -> None:
     assert PredictedSpread(A, B, -K, TIMING, 0.6).bound_s(mean_s=0.6) == 0.0
 
 
-def test_times_that_are_none_are_refused() -> None:
+def test_a_negative_mean_is_refused() -> None:
     with pytest.raises(BadModelError, match="mean_s is -1"):
         spread(0.6).bound_s(mean_s=-1.0)

@@ -61,7 +61,7 @@ def test_bounds_scale_with_time() -> None:
 
 def test_weak_delayed_part_takes_delays_of_any_length() -> None:
     assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.5) == inf
-    # 1 - mu < 1/4: the functional that holds for any length no longer proves stability
+    # 1 - mu < 1/4: the functional for any length no longer proves stability
     assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.8) < inf
 
 
@@ -132,7 +132,9 @@ def test_constant_delay_is_covered_by_the_exact_margin() -> None:
         (6.3, 0.01, 0.1, "none"),
     ],
 )
-def test_first_bound_that_covers_a_jitter(mean_s: float, spread_s: float, rate: float, cover: str) -> None:
+def test_a_jitter_is_covered_by_the_first_sufficient_bound(
+    mean_s: float, spread_s: float, rate: float, cover: str
+) -> None:
     verdict = bound_covering(A0, A1, mean_s=mean_s, spread_s=spread_s, rate=rate)
     assert verdict.cover == cover
     assert isnan(verdict.bound_s) if cover == "none" else mean_s + spread_s <= verdict.bound_s
@@ -182,7 +184,7 @@ def integral_gain(reach: NDArray[np.int_]) -> float:
 
 
 def worst_reach(reach: NDArray[np.int_]) -> NDArray[np.int_]:
-    """Where the deviation goes from here if at each instant it takes the side with more of the worst signal."""
+    """The next deviation in the search: at each instant it takes the side with more of the worst signal."""
     size = reach.size
     t = np.arange(size)
     for _ in range(15):
@@ -197,18 +199,18 @@ def worst_reach(reach: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_deviations_integral_has_at_most_the_gain_counted_on(seed: int) -> None:
+def test_a_deviations_integral_has_at_most_the_assumed_gain(seed: int) -> None:
     rng = np.random.default_rng(seed)
     anyhow = rng.integers(-CELLS, CELLS + 1, 4 * CELLS)
     assert integral_gain(anyhow) ** 2 <= 1.75
-    # the worst that the search finds is above what was proved for slow deviations, and near the bound
+    # the worst that the search finds exceeds the bound for slow deviations, and is near the bound for all
     assert 1.5 < integral_gain(worst_reach(anyhow)) ** 2 <= 1.75
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_deviation_that_overtakes_nothing_has_at_most_unit_gain(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # a sawtooth: rises by a cell a cell at most, and falls anyhow
+    # a sawtooth: it rises by at most one cell per cell, and falls by any amount
     reach = [0]
     for fall in np.where(rng.random(4 * CELLS) < 0.03, rng.integers(0, 2 * CELLS, 4 * CELLS), 0).tolist():
         reach.append(int(np.clip(reach[-1] + 1 - fall, -CELLS, CELLS)))
@@ -216,7 +218,7 @@ def test_deviation_that_overtakes_nothing_has_at_most_unit_gain(seed: int) -> No
 
 
 @pytest.mark.parametrize("rate", [1.0, inf])
-def test_follower_survives_what_is_worst_within_its_spread(rate: float) -> None:
+def test_follower_survives_adverse_delays_within_its_spread(rate: float) -> None:
     mean_s, step_s = 0.6 * delay_margin(*FOLLOWER), 0.01
     spread_s = spread_bound(*FOLLOWER, mean_s=mean_s, rate=rate)
     t = np.arange(4000) * step_s
