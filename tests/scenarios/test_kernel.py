@@ -1,4 +1,4 @@
-"""Kernels that count no references to arrays are returned none, which would never be freed."""
+"""Kernels that count no array references are returned no new arrays; how kernels are cached and compiled."""
 
 import gc
 import os
@@ -78,9 +78,7 @@ def loaded(file: Path) -> Any:
     return module
 
 
-def test_what_one_copy_of_the_source_compiled_no_other_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_copy_of_the_same_source_compiles_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from numba.core import config
 
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
@@ -125,7 +123,7 @@ def test_threads_calling_kernels_for_the_first_time_find_one_cache(
 @pytest.mark.parametrize(
     "changed", [("Pair", "y: int", "x: int"), ("Renamed", "x: int", "y: int")], ids=["reordered", "renamed"]
 )
-def test_a_tuple_that_changed_elsewhere_is_compiled_for_anew(
+def test_a_kernel_is_recompiled_after_its_tuple_changed_elsewhere(
     changed: tuple[str, str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kernel's file says nothing of the tuple, and the class that was cached is gone, as after an update."""

@@ -33,7 +33,7 @@ def test_reading_a_scenario_never_runs_its_code(tmp_path: Path) -> None:
 
 
 def test_a_copy_in_another_folder_is_the_same_experiment(tmp_path: Path) -> None:
-    """As vehicles in a process of their own read it from the folder of the run."""
+    """The vehicles, in a process of their own, read it from the folder of the run."""
     first = written(tmp_path / "deep")
     above = tmp_path / "above.toml"
     above.write_text(first.read_text().replace('"own.py:soft"', '"deep/own.py:soft"'))

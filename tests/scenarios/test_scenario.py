@@ -181,7 +181,7 @@ def test_errors_name_the_system_id_and_the_line() -> None:
 
 
 def test_every_error_that_the_schema_can_raise_has_a_text() -> None:
-    """The kinds of types in pydantic's core schema of a scenario."""
+    """All kinds of types in pydantic's core schema of a scenario are covered."""
     kinds = set(re.findall(r"'type': '([a-z-]+)'", repr(Scenario.__pydantic_core_schema__)))
     covered = {"model", "model-fields", "model-field", "default", "nullable", "int", "float", "bool", "str", "tuple"}
     one_fault = {"function-wrap", "function-after", "no-info", "union"}  # a key of two types, and system ids
@@ -301,7 +301,7 @@ def test_copters_take_off_to_a_given_altitude_that_they_reach(line: str, read: s
         parse(text.replace("altitude_m = 20.0", line, 1), FILE)
 
 
-def test_lists_made_whole_are_written_as_tomlkit_writes_them() -> None:
+def test_lists_are_written_as_tomlkit_writes_them() -> None:
     table = {"trace_s": [0.1, 2e-7, 3.0], "none": [], "rows": [[1, 2], [3, 4]], "names": ['a"b', "c"], "flags": [True]}
     data = {**table, "part": table, "parts": [table, {"x": 1}]}
     assert toml_text(data) == tomlkit.dumps(data)

@@ -1,4 +1,4 @@
-"""What a signed link refuses, with real bytes. The frames are pymavlink's, so that signing is done twice."""
+"""What a signed link refuses, with real bytes. The frames are pymavlink's, a second implementation of signing."""
 
 import hashlib
 from collections import Counter
@@ -30,7 +30,7 @@ def a_link(*, stamps: Stamps | None = None, key: bytes = KEY, owner: int = 0) ->
 
 
 def verdict(link: SignedLink, frame: bytes, now_ns: int = NOW_NS) -> str:
-    """Why a frame is refused, "" if it is not; the two exclude each other."""
+    """Why a frame is refused; "" if it is accepted."""
     refused: Counter[str] = Counter()
     good = link.verify(frame, now_ns, refused)
     assert refused.total() == (0 if good else 1)
@@ -45,7 +45,7 @@ def test_a_verified_frame_equals_pymavlinks_unsigned_frame() -> None:
 
 
 def test_a_genuine_frames_wrong_checksum_stays_wrong() -> None:
-    """As of a sender to which the message is another one: its definition is part of the checksum."""
+    """As from a sender that defines the message otherwise: the definition is part of the checksum."""
     sender = a_sender()
     frame = position(sender)
     extra = bytes([mavlink.CRC_EXTRA[32][0] ^ 1])
@@ -57,7 +57,7 @@ def test_a_genuine_frames_wrong_checksum_stays_wrong() -> None:
     assert refused == {"bad checksum": 1}
 
 
-def test_a_frame_that_is_signed_here_is_good_for_pymavlink() -> None:
+def test_pymavlink_accepts_a_frame_that_is_signed_here() -> None:
     link, receiver = a_link(), a_sender(system=255)
     for k in range(3):
         frame = link.sign(position(a_sender(key=None), north_m=k), NOW_NS)
@@ -138,7 +138,7 @@ def of_two_minutes_ago(frame: bytes) -> bytes:
         (of_two_minutes_ago, "too old"),
     ],
 )
-def test_what_is_refused_is_counted_by_reason_and_stops_nobody(made: Any, reason: str) -> None:
+def test_refused_frames_are_counted_by_reason_and_block_no_others(made: Any, reason: str) -> None:
     stamps = Stamps()
     link = a_link(stamps=stamps)
     good, kept = position(a_sender()), stamps.known.copy()
@@ -195,7 +195,7 @@ def test_timestamps_are_per_system_component_and_link_id() -> None:
     assert verdict(link, position(a_sender(timestamp=NOW))) == "overtaken"
 
 
-def test_two_owners_keep_their_timestamps_in_one_memory_without_touching() -> None:
+def test_two_owners_share_one_memory_without_mixing_their_timestamps() -> None:
     stamps = Stamps()
     one, two = a_link(stamps=stamps, owner=1), a_link(stamps=stamps, owner=2)
     frame = position(a_sender(system=255))
@@ -212,7 +212,7 @@ def test_a_forged_future_frame_silences_pymavlink_not_us() -> None:
     after = [position(genuine) for _ in range(10)]
     assert [verdict(ours, frame) for frame in after] == [""] * 10
     heard_by_pymavlink = [theirs.parse_buffer(frame)[0].get_type() for frame in after]
-    assert heard_by_pymavlink == ["BAD_DATA"] * 10  # it notes a timestamp before it has checked the signature
+    assert heard_by_pymavlink == ["BAD_DATA"] * 10  # pymavlink stores a timestamp before it checks the signature
 
 
 def test_after_a_restart_what_was_heard_before_it_is_refused() -> None:
@@ -223,7 +223,7 @@ def test_after_a_restart_what_was_heard_before_it_is_refused() -> None:
     restarted = a_link(stamps=Stamps(memory.memory))
     assert [verdict(restarted, frame) for frame in frames] == ["replayed", "replayed", "replayed", ""]
     forgetful = a_link()
-    assert verdict(forgetful, frames[0]) == ""  # which is why they are kept
+    assert verdict(forgetful, frames[0]) == ""  # which is why timestamps are stored
 
 
 def test_timestamps_increase_after_a_restart_with_an_earlier_clock() -> None:
@@ -251,7 +251,7 @@ def test_a_frame_with_any_flipped_bit_changes_nothing(bit: int, behind: int) -> 
 
 
 @given(data=st.binary(max_size=400) | st.binary(max_size=400).map(lambda rest: b"\xfd" + rest))
-def test_any_bytes_are_refused_and_nothing_has_changed(data: bytes) -> None:
+def test_any_bytes_are_refused_and_change_nothing(data: bytes) -> None:
     stamps = Stamps()
     refused: Counter[str] = Counter()
     link, kept = a_link(stamps=stamps), bytes(stamps.memory)

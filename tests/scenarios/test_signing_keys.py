@@ -1,4 +1,4 @@
-"""Key files: what is a key, who may read it, and that it does not get out."""
+"""Key files: what is a key, who may read it, and that it does not leak."""
 
 import hashlib
 import os
@@ -28,7 +28,7 @@ def a_file(folder: Path, data: bytes, mode: int = 0o600) -> Path:
     return file
 
 
-def test_three_forms_of_a_key_read_as_elsewhere(tmp_path: Path) -> None:
+def test_three_forms_of_a_key_are_read(tmp_path: Path) -> None:
     forms = {
         SECRET: SECRET,
         SECRET.hex().encode() + b"\n": SECRET,
@@ -53,7 +53,7 @@ def test_any_32_bytes_that_are_no_text_are_the_key(tmp_path_factory: pytest.Temp
 
 
 @pytest.mark.parametrize("data", [b"", b"\n", b"too short", b"\0" * 31, b"\0" * 33, b"a\nb" * 10, b"p" * 2000])
-def test_a_bad_key_is_one_line_that_hides_it(tmp_path: Path, data: bytes) -> None:
+def test_the_error_for_a_bad_key_does_not_show_it(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(KeyFileError, match="wanted 32 bytes, 64 hexadecimal digits, or a passphrase") as caught:
         read_key(a_file(tmp_path, data))
     assert "\n" not in str(caught.value)
@@ -122,7 +122,7 @@ def test_a_file_that_holds_no_timestamps_is_left_alone(tmp_path: Path) -> None:
     assert file.read_bytes() == b"somebody's letter"
 
 
-def test_an_entry_that_was_not_finished_is_none() -> None:
+def test_an_unfinished_entry_is_ignored() -> None:
     stamps = Stamps()
     stamps.keep(5, 100)
     whole = bytes(stamps.memory)
@@ -132,7 +132,7 @@ def test_an_entry_that_was_not_finished_is_none() -> None:
     assert Stamps(begun).known == {5: 100}
 
 
-def test_the_command_makes_a_key_and_says_nothing_of_it(tmp_path: Path) -> None:
+def test_the_command_makes_a_key_and_prints_nothing(tmp_path: Path) -> None:
     file = tmp_path / "formation.key"
     done = gcs("key", file)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -144,7 +144,7 @@ def test_the_command_makes_a_key_and_says_nothing_of_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("program", ["gcs.cli.main", "sim_vehicles.drive.cli"])
-def test_a_readable_key_is_one_line_and_exit_code_2(tmp_path: Path, program: str) -> None:
+def test_a_key_that_others_may_read_gives_exit_code_2(tmp_path: Path, program: str) -> None:
     file = a_file(tmp_path, SECRET, 0o644)
     scenario = SCENARIOS / "chain3.toml"
     fly = [*(["fly"] if program == "gcs.cli.main" else []), str(scenario), "--key", str(file)]

@@ -47,7 +47,7 @@ def test_what_is_written_is_read_with_its_sender_and_time(two: tuple[socket.sock
     assert other.getsockname() not in {found.address for found in batch}
 
 
-def test_of_each_socket_only_so_many_are_read_at_once(two: tuple[socket.socket, socket.socket]) -> None:
+def test_one_read_takes_a_limited_number_from_each_socket(two: tuple[socket.socket, socket.socket]) -> None:
     one, other = two
     for k in range(20):
         one.sendto(bytes([k]), other.getsockname())
@@ -58,7 +58,7 @@ def test_of_each_socket_only_so_many_are_read_at_once(two: tuple[socket.socket, 
     assert reader.read(both).table.shape == (5, 0)
 
 
-def test_more_than_there_is_room_for_waits_in_the_socket(two: tuple[socket.socket, socket.socket]) -> None:
+def test_datagrams_beyond_the_readers_room_wait_in_the_socket(two: tuple[socket.socket, socket.socket]) -> None:
     one, other = two
     other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
     reader, came, count = Reader(), 0, 0
@@ -67,7 +67,7 @@ def test_more_than_there_is_room_for_waits_in_the_socket(two: tuple[socket.socke
     while batch := [*reader.read([other.fileno()])]:
         assert [found.data[:2] for found in batch] == [k.to_bytes(2, "big") for k in range(came, came + len(batch))]
         came, count = came + len(batch), count + 1
-    assert count > 1 or came < 1000  # a small buffer, where the limit of the host holds
+    assert count > 1 or came < 1000  # or the host limits the buffer to a small one
     assert came > 100
 
 
