@@ -73,8 +73,7 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
 def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> dict[str, object]:
     """Names the bound that proves stability for all delays from `low_s` to `high_s`, and the delay up to which it does.
 
-    For varying delays of more than two vehicles, only the spread bound is tried: the matrix inequalities of the others
-    take minutes.
+    If delays of more than two vehicles vary, only the spread bound is tried: other bounds take minutes to compute.
     """
     hold_s, middle_s, spread_s = figures.timing.period_s / 2.0, (low_s + high_s) / 2.0, (high_s - low_s) / 2.0
     if figures.model.vehicles > 2 and rate > 0.0:

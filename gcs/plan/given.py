@@ -30,9 +30,8 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
 
     K has a row for each vehicle and a column for each error of one axis, in the order of
     `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
-    velocity error. `gains.design` finds such a K; so does any LQR for A and B of this model, with the opposite sign:
-    its law is u = -K e. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite
-    numbers.
+    velocity error. `gains.design` finds such a K; an LQR for A and B of this model finds -K, as its law is u = -K e.
+    Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
     """
     formation = plan_formation(scenario)
     model, gain = formation.model, real_matrix("K", K)

@@ -74,12 +74,11 @@ def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
 
 
 def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Window:
-    """Range of one vehicle's loop delays in which its loop is predicted to be stable.
+    """Range of one vehicle's loop delays in which its loop is predicted stable; if not `is_modelled`, up to the margin.
 
     The links of all other vehicles stay as they are in the scenario. If a shared loop is unstable over the scenario's
     links, shorter delays of this vehicle are searched; the result is (0, 0) if none makes it stable. The growth changes
-    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead. If
-    the flights are not modelled (`is_modelled`), the range ends at the plan's margin, NaN if that is unknown.
+    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead.
     """
     block = loop_of(plan, system_id)
     if not is_modelled(plan):
@@ -160,8 +159,7 @@ def link_delays_left_s(plan: FlightPlan, now_s: Mapping[int, float]) -> dict[int
 def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
     """The margin (s) of each of the plan's gains over the scenario's links; None if the margins for equal delays apply.
 
-    They apply unless vehicles share a loop over different links. All delays of such a loop are scaled together
-    until it breaks; its margin is then the delay of its slowest vehicle.
+    If vehicles share a loop over different links, its margin is its slowest vehicle's delay when the loop breaks.
     """
     if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
         return None

@@ -70,8 +70,7 @@ _MORE = 1.1
 def flight_plan(scenario: Scenario, link: LinkPart | None = None) -> tuple[Design, FlightPlan]:
     """The design of a scenario and the plan to fly it. The design records `link`, the measured links, if given.
 
-    Raises gains.core.errors.GainsError if the requirement cannot be met, and gcs.errors.InputError if links have still
-    to be measured, or if the user's law or an unstable own loop is refused.
+    Raises GainsError if the requirement cannot be met; InputError if links are unmeasured or a law or loop is refused.
     """
     if scenario.control.for_link == "measured":
         raise InputError(f"{scenario.name}: control.for_link: {MEASURED_WANTED}")
