@@ -110,15 +110,17 @@ def fly(
             if mirror is not None:
                 to = opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
         unmeasured = links_of is None and scenario.control.for_link == "measured"
-        there = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
+        presence = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
         scenario, measured = (
-            chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
+            chosen_now(scenario, link, presence, key, shown=not as_json)
+            if unmeasured
+            else chosen_for(scenario, links_of)
         )
         design, plan = flight_plan(scenario, measured)
         design, plan = options.flyable(scenario_file, design, plan, allow_unstable=allow_unstable)
         design = with_trade_off(design)
-        there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
-        taken_over = there is not None and bool(there.taken_over())
+        presence = presence or (None if link is None or connect is not None else Presence(link, plan.scenario))
+        taken_over = presence is not None and bool(presence.taken_over())
         if not as_json:
             print_design(design)
         viewer = new_viewer() if live == "new" else live and viewer_url(*options.address("--live", live))
@@ -140,8 +142,8 @@ def fly(
                 mirror=to,
                 viewer=viewer,
             )
-        if there is not None and taken_over:
-            there.shut_down()
+        if presence is not None and taken_over:
+            presence.shut_down()
         summary = leave_report(folder, summary)
     options.answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     passed = _passed(summary, assert_headroom, assert_settled, junit)

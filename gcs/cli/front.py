@@ -55,17 +55,22 @@ def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, 
 
 
 def chosen_now(
-    scenario: "Scenario", link: "StationSocket | None", there: "Presence | None", key_file: Path | None, *, shown: bool
+    scenario: "Scenario",
+    link: "StationSocket | None",
+    presence: "Presence | None",
+    key_file: Path | None,
+    *,
+    shown: bool,
 ) -> "tuple[Scenario, LinkPart]":
     """Measure the links of a scenario now, and return it with gains for them and the reason for these gains.
 
-    The links are measured through `link`, or in virtual time if it is None. `there` takes over simulated vehicles
+    The links are measured through `link`, or in virtual time if it is None. `presence` takes over simulated vehicles
     that run already; if none do, they are started. It is None if other vehicles are to be flown.
     """
     from gcs.watch.before_flight import measured_now
     from gcs.watch.for_link import best_for
 
-    starts = there is not None and not there.taken_over()
+    starts = presence is not None and not presence.taken_over()
     return best_for(scenario, measured_now(scenario, link, start_vehicles=starts, key_file=key_file, shown=shown))
 
 

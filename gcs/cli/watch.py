@@ -145,25 +145,25 @@ def replay(
 
     if save_links is not None:
         options.out_file("--save-links", save_links)
-    there = find_log(run)
-    log = read_tlog(there.log_file)
+    found = find_log(run)
+    log = read_tlog(found.log_file)
     if scenario_file is not None:
         scenario = _formation(scenario_file, given)
         if (networks := networks_of(vehicle.system_id for vehicle in scenario.vehicles)) != [0]:
             read = f"vehicles in the networks {' '.join(map(str, networks))}"
             raise InputError(f"{scenario_file}: read {read}, wanted network 0 alone: a log does not name its network")
-        there = replace(there, scenario=scenario, design=None, recorded=None)
+        found = replace(found, scenario=scenario, design=None, recorded=None)
     if given is not None:
-        there = replace(there, design=given)
-    elif there.design is None and there.scenario is not None:
+        found = replace(found, design=given)
+    elif found.design is None and found.scenario is not None:
         from gcs.plan.planner import flight_plan, over_own_links
 
-        there = replace(there, design=over_own_links(*flight_plan(there.scenario))[0])
-    options.answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
+        found = replace(found, design=over_own_links(*flight_plan(found.scenario))[0])
+    options.answer(rebuild_report(log, found), _print_rebuilt, as_json=as_json)
     if save_links is not None:
         from gcs.watch.saved_links import recorded
 
-        _save(save_links, recorded(log.frames), f"gcs replay of {there.log_file.name}", shown=not as_json)
+        _save(save_links, recorded(log.frames), f"gcs replay of {found.log_file.name}", shown=not as_json)
 
 
 def _formation(scenario_file: Path, given: "Design | None") -> "Scenario":
