@@ -123,13 +123,15 @@ class FlightState:
                 self._add_news(event)
         if not ticks.size:
             return
-        numbers = np.concatenate([self._window["tick"][-1:, 0], ticks["tick"][:, 0]])
-        self.skipped += int(np.sum(np.diff(numbers) - 1))
+        before = ticks["tick"][0, 0] - 1 if np.isnan(self.time_s) else self.newest["tick"][0]
+        self.skipped += int(ticks["tick"][-1, 0] - before) - len(ticks)
         self.newest = ticks[-1]
         self.time_s = float(ticks["time_s"][-1, 0])
         self.rtt_s = self._newest_rtt_s.fill(ticks["rtt_s"])[-1]
         window = np.concatenate([self._window, ticks])
-        self._window = window[window["time_s"][:, 0] > self.time_s - WINDOW_S]
+        flown = window[window["commanded"].any(axis=1)]
+        window = flown if flown.size else window
+        self._window = window[window["time_s"][:, 0] > window["time_s"][-1, 0] - WINDOW_S]
 
     def _add_news(self, event: Event) -> None:
         same = (event.kind, event.text, event.time_s // TOGETHER_S)
@@ -143,8 +145,7 @@ class FlightState:
 
     def figures(self) -> "Figures":
         """The figures to show; NaN where unknown. After the flight they stay those of its last commands."""
-        now, flown = self.newest, self._window[self._window["commanded"].any(axis=1)]
-        window = flown if flown.size else self._window
+        now, window = self.newest, self._window
         heard = window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
         loop_delay_s, headroom = (np.where(heard, window[name], np.nan) for name in ("loop_delay_s", "headroom"))
         late_s = (window["sent_ns"].max(axis=1, keepdims=True) - window["due_ns"][:, :1]) / 1e9
@@ -155,7 +156,7 @@ class FlightState:
             headroom=_quantile(headroom, 0.0),
             modes=[Mode(int(mode)) for mode in now["mode"]],
             lateness_s_p99=float(_quantile(late_s, 0.99)[0]),
-            gain_set=int(window["gain_set"][-1:].max(initial=0)),
+            gain_set=int(window["gain_set"][-1:].max(initial=0, where=window["commanded"][-1:])),
         )
 
 

@@ -123,7 +123,7 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     last = flown[flown["tick"] == flown["tick"][-1]]
     if broken := _broken(scenario, last):
         return broken
-    known = {vehicle.system_id for vehicle in scenario.vehicles}
+    known = {vehicle.system_id for vehicle in scenario.vehicles} - {scenario.external_id}
     left = sorted(known - set(last["system_id"].tolist()) - rebuilt.grounded.keys())
     if left:
         return f"vehicles {', '.join(map(str, left))} are sent nothing at the end"  # lost, or flown by their pilots

@@ -65,6 +65,24 @@ def test_at_the_end_figures_are_those_of_the_last_commands() -> None:
     assert (figures.gain_set, figures.headroom.tolist()) == (1, [0.4, 0.4])
 
 
+def test_a_long_silence_after_the_flight_leaves_its_figures() -> None:
+    """A vehicle that does not confirm that it holds is waited for, longer than the figures' window."""
+    ticks = ticks_of(line(2), start_s=0.0, count=450)
+    ticks["commanded"][:100], ticks["headroom"][:100] = True, 0.4
+    ticks["headroom"][100:] = -20.0
+    state = flown(line(2), ticks[:100])
+    for part in np.array_split(ticks[100:], 10):
+        state.add(part, [])
+    assert state.figures().headroom.tolist() == [0.4, 0.4]
+    assert (state.time_s, state.skipped) == (ticks["time_s"][-1, 0], 0)
+
+
+def test_the_gain_set_of_a_lost_vehicle_is_not_flown() -> None:
+    ticks = ticks_of(line(3), start_s=0.0, count=50)
+    ticks["commanded"][:, :2], ticks["gain_set"][:, 2] = True, 1
+    assert flown(line(3), ticks).figures().gain_set == 0
+
+
 def test_the_age_of_a_lost_vehicle_is_no_loop_delay() -> None:
     ticks = ticks_of(line(3), start_s=0.0, count=50)
     ticks["loop_delay_s"], ticks["headroom"] = 0.05, 0.8

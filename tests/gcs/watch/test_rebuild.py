@@ -22,6 +22,7 @@ from gcs.watch.rebuild import rebuild
 from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
+from scenarios.keys.course import Course
 from scenarios.keys.link import Link, Links, VehicleLinks
 from scenarios.schema import NS_PER_S, NominalVelocity, Scenario
 from sim_vehicles.drive.fleet import Fleet
@@ -196,6 +197,12 @@ def test_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
     rebuilt = rebuild_report(parse_tlog(log_bytes(kept)), source).flight
     assert rebuilt is not None
     assert (rebuilt.verdict, rebuilt.reason) == ("aborted", "vehicles 3 are sent nothing at the end")
+
+
+def test_a_leader_flown_by_somebody_else_is_sent_nothing_and_not_missed() -> None:
+    scenario = scenario_of("chain3").model_copy(update={"course": Course(leader="external")})
+    summary, rebuilt = rebuilt_with(scenario, Fleet(scenario, START_NS))
+    assert (rebuilt.verdict, rebuilt.reason) == (summary.verdict, summary.reason) == ("stable", COMPLETED)
 
 
 class Unanswering:
