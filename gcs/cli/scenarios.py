@@ -196,7 +196,8 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     """Lines on the loop delay expected over the links, and on the headroom it leaves."""
     from gcs.views.console import ms_text, number_text
 
-    slowest = max(found.vehicles, key=lambda v: v.expected_loop_delay_s)
+    commanded = [v for v in found.vehicles if v.expected_loop_delay_s is not None]
+    slowest = max(commanded, key=lambda v: v.expected_loop_delay_s or 0.0)
     margin_s = design.margin_of(slowest.system_id)
     margin = "no limit" if margin_s is None else ms_text(margin_s)
     margin = "unknown" if design.margin_unknown else margin
@@ -207,8 +208,8 @@ def _delay_lines(design: "Design", found: "ScenarioCheck") -> "Iterator[str]":
     else:
         margin = f"margin {margin}"
     unstable = "" if found.headroom is None or found.headroom > 0.0 else ": unstable"
-    whose = "" if len({v.expected_loop_delay_s for v in found.vehicles}) == 1 else f" for vehicle {slowest.system_id}"
-    least = min(found.vehicles, key=lambda v: inf if v.headroom is None else v.headroom)
+    whose = "" if len({v.expected_loop_delay_s for v in commanded}) == 1 else f" for vehicle {slowest.system_id}"
+    least = min(commanded, key=lambda v: inf if v.headroom is None else v.headroom)
     of = "" if least is slowest or not whose else f" of vehicle {least.system_id}"
     yield (
         f"delay    loop {ms_text(found.expected_loop_delay_s, unit='')} ± {ms_text(found.phase_s)} expected from the "

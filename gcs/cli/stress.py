@@ -197,7 +197,7 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, seeds: int, *, s
 def _refuse_vehicle(system_id: int, study: "Study", given: list[tuple[str, str]]) -> None:
     from gcs.plan.loops import plan_loops
 
-    known = study.plan.formation.system_ids
+    known = [own for loop in plan_loops(study.plan) for own in loop.system_ids]
     if system_id not in known:
         raise InputError(f"--onset-of: read {system_id}, wanted one of the system ids {' '.join(map(str, known))}")
     if given:

@@ -56,8 +56,12 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
 
 
 def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
-    """The expected loop delays (s) of a plan's vehicles; on board, from the oldest state that each command needs."""
-    return expected_loop_delays_s(plan.scenario, _heard(plan))
+    """The expected loop delays (s) of a plan's vehicles; on board, from the oldest state that each command needs.
+
+    A leader flown by somebody else has none.
+    """
+    expected_s = expected_loop_delays_s(plan.scenario, _heard(plan))
+    return {own: expected_s[own] for own in _planned_paths(plan)}
 
 
 def _heard(plan: FlightPlan) -> dict[int, set[int]]:
@@ -105,7 +109,7 @@ def expected_loop_delays_s(
 
 def drawn_delays(plan: FlightPlan) -> dict[int, DrawnDelays]:
     """Delays drawn over the links of each of a plan's vehicles; `planned_loop_delays_s` has their medians."""
-    paths = _paths(plan.scenario, _heard(plan))
+    paths = _planned_paths(plan)
     drawn = _drawn(plan.scenario, dict.fromkeys(paths.values()))
     return {own: drawn[path] for own, path in paths.items()}
 
@@ -123,6 +127,12 @@ def _paths(scenario: Scenario, heard: Mapping[int, Collection[int]]) -> dict[int
     return {own: (tuple(links[k][0] for k in states_of[own]), down) for own, (_, down) in links.items()}
 
 
+def _planned_paths(plan: FlightPlan) -> dict[int, _Path]:
+    """The paths of the vehicles that the station commands."""
+    paths = _paths(plan.scenario, _heard(plan))
+    return {own: path for own, path in paths.items() if own != plan.scenario.external_id}
+
+
 def _drawn(scenario: Scenario, paths: Collection[_Path]) -> dict[_Path, DrawnDelays]:
     rng = np.random.default_rng(0)
     ages_s = {ups: _ages_s(scenario, ups, rng) for ups in dict.fromkeys(ups for ups, _ in paths)}
@@ -137,7 +147,7 @@ def effective_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     command stays in force (`gains.sampled.multirate.effective_delay_s`). They are infinite if next to nothing arrives.
     A prediction knows the age of each state, whatever was lost, so only the mean delay of set-points counts.
     """
-    scenario, paths, expected_s = plan.scenario, _paths(plan.scenario, _heard(plan)), planned_loop_delays_s(plan)
+    scenario, paths, expected_s = plan.scenario, _planned_paths(plan), planned_loop_delays_s(plan)
     rng, found = np.random.default_rng(0), dict[_Path, float]()
     for own, (ups, down) in paths.items():
         counting = (down,) if scenario.control.prediction != "off" else (*ups, down)
@@ -179,7 +189,8 @@ def setpoint_gaps(scenario: Scenario) -> float:
     The vehicle then enters failsafe. Neither outages of links nor bandwidth are included.
     """
     rng, often = np.random.default_rng(0), dict[Link, float]()
-    downs = [scenario.link_of(vehicle.system_id)[1] for vehicle in scenario.vehicles]
+    commanded = {vehicle.system_id for vehicle in scenario.vehicles} - {scenario.external_id}
+    downs = [scenario.link_of(system_id)[1] for system_id in commanded]
     for down in dict.fromkeys(downs):
         enters_s, late_s = _set_points(scenario, down, rng)
         arrived_s = np.sort((enters_s + late_s)[np.isfinite(late_s)])

@@ -30,9 +30,12 @@ def is_modelled(plan: FlightPlan) -> bool:
 
 
 def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
-    """The coupled blocks of a plan, with the vehicles' responses if they are known."""
+    """The coupled blocks of a plan, with the vehicles' responses if they are known.
+
+    A leader flown by somebody else has none: the station closes no loop over its links.
+    """
     responses = plan.responses_in_order if is_modelled(plan) else None
-    return coupled_blocks(
+    blocks = coupled_blocks(
         plan.model,
         plan.gain,
         plan.formation.system_ids,
@@ -42,6 +45,7 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
         responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
         response_states=() if responses is None else response_states(plan.model, responses),
     )
+    return [block for block in blocks if plan.scenario.external_id not in block.system_ids]
 
 
 def loop_of(plan: FlightPlan, system_id: int) -> CoupledBlock:
@@ -232,8 +236,14 @@ def _shared_margins_s(plan: FlightPlan, block: CoupledBlock, margin_s: float) ->
 
 
 def unlimited(plan: FlightPlan) -> dict[int, tuple[float, ...]]:
-    """Infinite margins, by row, for the vehicles without any delayed feedback; empty if none has delayed feedback."""
-    row, blocks = plan.formation.row, plan_loops(plan)
+    """Infinite margins, by row, for the vehicles without any delayed feedback; empty if none has delayed feedback.
+
+    With loops on the ground, only a leader flown by somebody else has no feedback: the station commands nothing.
+    """
+    row, leader = plan.formation.row, plan.scenario.external_id
+    if plan.onboard is None:
+        return {} if leader is None else {row(leader): (inf,) * len(plan.gains)}
+    blocks = plan_loops(plan)
     late = [block for block in blocks if block.has_late_terms]
     at_once = [own for block in blocks if not block.has_late_terms for own in block.system_ids]
     return {row(own): (inf,) * len(plan.gains) for own in at_once} if late else {}

@@ -171,7 +171,8 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the loop as flown, with its figures at the loop delay, from those of the ground loop."""
     if plan.onboard is not None:
         design, plan = onboard_plan(design, plan)
-        plan = replace(plan, own_margins_s=unlimited(plan))
+    if own_s := unlimited(plan):
+        plan = replace(plan, own_margins_s=own_s)
         design = _with_own_margins(design, plan)
     if plan.scenario.control.prediction != "off":
         design = design.model_copy(update={"prediction": _prediction(plan)})

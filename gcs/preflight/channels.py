@@ -15,7 +15,7 @@ from gcs.control.phases import longest_round_trip_s
 from gcs.control.tick import TickArray, in_sequence
 from gcs.drive.flown import Flight, effective_delays_s
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
-from gcs.plan.expected_delay import DrawnDelays
+from gcs.plan.expected_delay import DrawnDelays, planned_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan, Responses
 from gcs.runs.grade import instants, true_loop_delays_s
 from gcs.station.station import Station
@@ -51,7 +51,7 @@ class OverChannels(NamedTuple):
 
 def over_channels(plan: FlightPlan) -> OverChannels:
     """Fly the start of a plan, to see how long its commands take over channels of limited bandwidth."""
-    ids, seed = plan.formation.system_ids, plan.scenario.seed
+    ids, seed = [*planned_loop_delays_s(plan)], plan.scenario.seed
     use = {name: share * _WIDE for name, share in _start(_over_wide(plan), seed).use.items()}
     starts = list[OverChannels]()
     for k in range(max(1, min(_FLIGHTS, _VEHICLES // len(ids)))):

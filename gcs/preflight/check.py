@@ -44,7 +44,8 @@ class VehicleCheck(Published):
     """Magnitude of the first command, before any limit."""
     command_max_m_s2: float | None
     """The largest acceleration that its limits allow at its initial speed; None without a limit."""
-    expected_loop_delay_s: float
+    expected_loop_delay_s: float | None
+    """None for a leader flown by somebody else, which the station does not command."""
     headroom: float | None
     """Defined as for the formation, at this vehicle's own expected loop delay."""
     link_delay_left_s: float | None
@@ -156,8 +157,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 spacing_error_m=float(hypot(*errors[model.spacing_slice(row)])) if row else None,
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
-                expected_loop_delay_s=delays_s[own],
-                headroom=_known(_headroom(plan, row, delays_s[own], delays_s[own])),
+                expected_loop_delay_s=delays_s.get(own),
+                headroom=_known(_headroom(plan, row, at_s, at_s)) if (at_s := delays_s.get(own)) is not None else None,
                 link_delay_left_s=_known(left_s.get(own, inf)),
             )
         )
@@ -167,7 +168,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     tolerated = plan.tolerance(assumed_s)
     shorter_s, margin_s = tolerated.shorter_s[0], tolerated.longer_s[0]
     window_s = max(0.0, assumed_s - shorter_s), assumed_s + margin_s
-    left = {own: _headroom(plan, row, effective_s[own], delays_s[own]) for row, own in enumerate(formation.system_ids)}
+    left = {own: _headroom(plan, formation.row(own), at_s, delays_s[own]) for own, at_s in effective_s.items()}
     critical = min(left, key=left.__getitem__)
     nearest = nearest_planned(scenario)
     return ScenarioCheck(
@@ -238,10 +239,9 @@ def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | N
     """
     prediction, late = plan.scenario.control.prediction, dict[tuple[int, Tolerated], float]()
     wait_s = _phase_s(plan.scenario)
-    for row, system_id in enumerate(plan.formation.system_ids):
-        own = drawn[system_id]
+    for system_id, own in drawn.items():
         assumed_s = _assumed_s(plan, float(own.loop_s.mean()))
-        tolerated = plan.tolerance_of(row, assumed_s)
+        tolerated = plan.tolerance_of(plan.formation.row(system_id), assumed_s)
         if (kind := (id(own), tolerated)) not in late:
             mismatch_s = own.loop_s if prediction == "off" else own.down_s + own.ages_s.mean() - assumed_s
             waits_s = (-wait_s, wait_s) if prediction not in {"measured", "off"} else (0.0,)

@@ -132,7 +132,7 @@ def plan_of(trial: Trial) -> FlightPlan:
     plan = FlightPlan(
         scenario, formation, K, trial.delay_margin_s, separable=separable, responses=trial.responses, law=law
     )
-    return replace(plan, own_margins_s=unlimited(plan)) if plan.onboard is not None else plan
+    return replace(plan, own_margins_s=unlimited(plan))
 
 
 def with_verdict(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

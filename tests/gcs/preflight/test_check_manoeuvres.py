@@ -2,9 +2,12 @@
 
 import pytest
 
-from gcs.plan.planner import flight_plan
+from gcs.plan.loops import plan_loops
+from gcs.plan.planner import flight_plan, over_own_links
 from gcs.preflight.check import check
 from scenarios.files import load
+from scenarios.keys.course import Course
+from scenarios.keys.link import Link, Links, VehicleLinks
 from scenarios.schema import Control, FixedGains, Limits
 from tests.support.paths import SCENARIOS
 
@@ -28,3 +31,23 @@ def test_vehicles_that_cannot_fly_the_plan_are_named() -> None:
     # the last vehicles of both platoons fly farthest out
     assert beyond.keys() >= {3, 5}
     assert beyond[5] == ("speed_max_m_s", "acceleration_max_m_s2")
+
+
+def test_the_links_of_a_leader_flown_by_somebody_else_judge_nothing() -> None:
+    """The station closes no loop over them: such a flight settled with 87 % of headroom."""
+    slow = Link(delay_s=0.7)
+    links = Links(
+        up=Link(delay_s=0.02), down=Link(delay_s=0.02), vehicles=(VehicleLinks(system_id=1, up=slow, down=slow),)
+    )
+    chain = load(SCENARIOS / "chain3.toml").model_copy(update={"links": links, "course": Course(leader="external")})
+    design, plan = over_own_links(*flight_plan(chain))
+    found = check(plan)
+    leader, *followers = found.vehicles
+    assert (leader.expected_loop_delay_s, leader.headroom, leader.link_delay_left_s) == (None, None, None)
+    assert [own.expected_loop_delay_s for own in followers] == pytest.approx([0.05, 0.05])
+    assert found.headroom == found.effective_headroom == pytest.approx(1.0 - 0.05 / 0.3)
+    assert (found.headroom_p99 or 0.0) > 0.75
+    assert design.at_loop_delay is not None
+    assert design.at_loop_delay.loop_delay_s == pytest.approx(0.05)
+    assert (design.margin_of(1), design.margin_of(2)) == (None, pytest.approx(0.3))  # as gcs monitor judges them
+    assert [loop.system_ids for loop in plan_loops(plan)] == [(2,), (3,)]

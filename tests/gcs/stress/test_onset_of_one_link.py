@@ -14,6 +14,7 @@ from gcs.preflight.check import check
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from scenarios.files import dump, load, parse
+from scenarios.keys.course import Course
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Scenario
 from scenarios.shipped import located
@@ -111,6 +112,13 @@ def test_options_without_an_onset_of_one_link_are_refused(options: list[str], wa
     result = CliRunner().invoke(app, ["stress", "chain3_bidirectional", *options])
     assert isinstance(result.exception, InputError)
     assert wanted in str(result.exception)
+
+
+def test_the_link_of_a_leader_flown_by_somebody_else_is_refused(tmp_path: Path) -> None:
+    scenario = tmp_path / "led.toml"
+    scenario.write_text(dump(SCENARIO.model_copy(update={"course": Course(leader="external")})), encoding="utf-8")
+    result = CliRunner().invoke(app, ["stress", str(scenario), "--onset-of", "1"])
+    assert str(result.exception) == "--onset-of: read 1, wanted one of the system ids 2"
 
 
 def test_what_is_printed_names_the_vehicle_and_what_is_left(tmp_path: Path) -> None:
