@@ -93,7 +93,7 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     ages_s = _ages_s(plan, flown)
     loop = critical_block(plan_loops(plan), delays_s, ages_s)
     loop_s, link_s, _ = _delays_of(plan, loop, delays_s, outcome)
-    outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s)
+    outcome = replace(outcome, critical=_named_vehicle(loop, delays_s, outcome), link_delay_s=link_s)
     if not _is_commanded(flown, loop):
         return outcome
     outcome = replace(outcome, loop_delay_s=round(loop_s, 9))
@@ -120,13 +120,14 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     up, down = links = base.scenario.link_of(critical.system_ids[0])
     known_s = round(waiting_s, 9) if _is_commanded(fresh, critical) else None
     outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=known_s)
+    named = _named_vehicle(critical, delays_s, outcome)
 
     def respond(amplitude: float) -> FreeResponse:
         ids, run = probed.system_ids, _folder_of(folder, amplitude)
         scenario = free_response.probe_scenario(base, ids, amplitude=amplitude, links=links, waiting_s=waiting_s)
         return free_response.response_alone(base, scenario, ids, real_time=trial.real_time, folder=run)
 
-    return _with_response(probed, critical, respond, outcome, amplitudes=_amplitudes(base))
+    return _with_response(probed, named, respond, outcome, amplitudes=_amplitudes(base))
 
 
 def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
@@ -144,7 +145,9 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
         run = _folder_of(folder, amplitude)
         return free_response.response_paired(base, calm, probed.system_ids, amplitude=amplitude, folder=run)
 
-    return _with_response(probed, probed, respond, outcome, amplitudes=_amplitudes(base))
+    return _with_response(
+        probed, _named_vehicle(probed, delays_s, outcome), respond, outcome, amplitudes=_amplitudes(base)
+    )
 
 
 def _amplitudes(plan: FlightPlan) -> Sequence[float]:
@@ -158,17 +161,17 @@ def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
 
 def _with_response(
     loop: CoupledBlock,
-    critical: CoupledBlock,
+    critical: int,
     respond: Callable[[float], FreeResponse],
     outcome: Outcome,
     *,
     amplitudes: Sequence[float],
 ) -> Outcome:
-    """The outcome with the growth rate of `loop`, which stands in for the critical one.
+    """The outcome with the growth rate of `loop`, which stands in for that of vehicle `critical`.
 
     The initial error is the first of `amplitudes` that does not leave the linear range too soon.
     """
-    outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
+    outcome = replace(outcome, probed=loop.system_ids[0], critical=critical)
     for amplitude in amplitudes:
         response = respond(amplitude)
         outcome = with_verdict(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))

@@ -63,15 +63,16 @@ class Outcome:
 
     `verdict` is that of the whole flight for an own trial. For a probe it follows from the sign of the growth rate.
     A probe without a growth rate is "aborted" if its flight was, else "unknown", even if its errors broke a limit.
-    `probed` is the first vehicle of the measured loop. That loop stands in for the loop of vehicle `critical`, with the
-    same wait for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
-    (see `gains.sampled.multirate`; on constant links every command has it); for an own trial it is the measured median.
-    `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
-    models' growth rates at `loop_delay_s`. The growth of an own trial is that of the envelope of all spacing errors, a
-    rough figure. `ticks_sha256` is the hash of the tick log in virtual time; it is the same in any process.
-    `past_limits` says that random links alone, without any initial error, push vehicles past the scenario's limits; a
-    probe is flown without these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`.
-    `error` holds a traceback if the trial failed.
+    `probed` is the first vehicle of the measured loop. That loop stands in for the loop of vehicle `critical`, of
+    several that share it the slowest or the one whose link alone was slowed, with the same wait for the control tick
+    (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit (see `gains.sampled.multirate`;
+    on constant links every command has it); for an own trial it is the measured median. `loop_delay_spread_s` is the
+    90th percentile of the measured loop delays minus their median. `predicted_*` are the models' growth rates at
+    `loop_delay_s`. The growth of an own trial is that of the envelope of all spacing errors, a rough figure.
+    `ticks_sha256` is the hash of the tick log in virtual time; it is the same in any process. `past_limits` says that
+    random links alone, without any initial error, push vehicles past the scenario's limits; a probe is flown without
+    these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a
+    traceback if the trial failed.
     """
 
     id: str

@@ -150,6 +150,25 @@ def test_without_set_points_vehicles_keep_their_places_by_own_sensors() -> None:
         assert vehicle(fleet, k + 1).flight.failsafe
 
 
+def test_an_asymmetric_link_shows_an_error_that_is_not_there() -> None:
+    """The sensor on board keeps the place; the station takes the vehicle to be where it was half the asymmetry ago."""
+    scenario = onboard("chain3", duration_s=15.0)
+    one_sided = VehicleLinks(system_id=3, up=Link(delay_s=0.16), down=Link(delay_s=0.02))
+    links = scenario.links.model_copy(update={"vehicles": (one_sided,)})
+    plan = flight_plan(scenario.model_copy(update={"links": links}))[1]
+    fleet = Fleet(plan.scenario, START_NS)
+    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=fleet)))
+    last = ticks[(ticks["system_id"] == 3) & (ticks["time_s"] < 15.0)][-1]
+    speed_m_s = np.hypot(*scenario.nominal_velocity_at(15.0))
+    shown_m = np.hypot(last["spacing_error_north_m"], last["spacing_error_east_m"])
+    assert shown_m == pytest.approx(0.07 * speed_m_s, rel=1e-3)
+    now_ns = int(last["sent_ns"]) + 500_000_000
+    fleet.step((), now_ns)
+    ahead, own = (fleet.state(system_id, now_ns) for system_id in (2, 3))
+    north_m, east_m = plan.formation.offset_ne_m[2]
+    assert np.hypot(own.north_m - ahead.north_m - north_m, own.east_m - ahead.east_m - east_m) < 0.01
+
+
 @pytest.mark.parametrize("act", [False, True])
 def test_when_one_is_lost_all_keep_place_by_own_loops(act: bool) -> None:
     """Vehicle 2, which the others act on and which acts on them, is not heard and hears nothing for six seconds."""

@@ -33,7 +33,7 @@ def test_vehicles_that_cannot_fly_the_plan_are_named() -> None:
     assert beyond[5] == ("speed_max_m_s", "acceleration_max_m_s2")
 
 
-def test_the_links_of_a_leader_flown_by_somebody_else_judge_nothing() -> None:
+def test_the_links_of_an_external_leader_judge_nothing() -> None:
     """The station closes no loop over them: such a flight settled with 87 % of headroom."""
     slow = Link(delay_s=0.7)
     links = Links(

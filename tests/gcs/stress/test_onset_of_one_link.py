@@ -15,7 +15,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from scenarios.files import dump, load, parse
 from scenarios.keys.course import Course
-from scenarios.keys.link import Link, VehicleLinks
+from scenarios.keys.link import Jitter, Link, VehicleLinks
 from scenarios.schema import Scenario
 from scenarios.shipped import located
 from tests.support.fleets.stress_pair import SCENARIO
@@ -83,6 +83,17 @@ def test_a_loop_with_unlike_links_breaks_where_its_model_does() -> None:
     assert [own.verdict for own in onset.own] == ["stable", "unstable"]  # both past the margin of equal links
 
 
+def test_the_vehicle_that_waits_is_the_slowest_of_its_loop() -> None:
+    """Only its link jitters: the others wait for the tick alone."""
+    late = Link(delay_s=0.1, jitter=Jitter(distribution="exponential", scale_s=0.04))
+    scenario = with_links(load(located("chain3_bidirectional")), all=0.1, v3=0.1)
+    links = scenario.links.model_copy(update={"vehicles": (VehicleLinks(system_id=3, up=late, down=late),)})
+    study = study_of(scenario.model_copy(update={"links": links}))
+    found = fly_trial(study.trial("probe", {"delay": 0.2}, seed=1))
+    assert found.critical == 3
+    assert known(found.waiting_s) > 0.06  # two mean jitters, and part of a period of 20 ms
+
+
 def test_states_of_one_age_leave_one_delay_for_each_command() -> None:
     """The model in positions beside the one in errors, which has no ages."""
     [block] = plan_loops(study_of(load(located("chain3_bidirectional"))).plan)
@@ -114,7 +125,7 @@ def test_options_without_an_onset_of_one_link_are_refused(options: list[str], wa
     assert wanted in str(result.exception)
 
 
-def test_the_link_of_a_leader_flown_by_somebody_else_is_refused(tmp_path: Path) -> None:
+def test_the_link_of_an_external_leader_has_no_onset(tmp_path: Path) -> None:
     scenario = tmp_path / "led.toml"
     scenario.write_text(dump(SCENARIO.model_copy(update={"course": Course(leader="external")})), encoding="utf-8")
     result = CliRunner().invoke(app, ["stress", str(scenario), "--onset-of", "1"])
@@ -164,17 +175,30 @@ def test_a_shared_loop_may_break_far_below_its_margin() -> None:
     flown, plan_flown = over_own_links(design, plan)
     found = check(plan_flown)
     _, follower = found.vehicles
-    assert plan.delay_margin_s > 0.6 > follower.expected_loop_delay_s
+    assert plan.delay_margin_s > 0.6 > known(follower.expected_loop_delay_s)
     assert flown.delay_margin_s == plan_flown.delay_margin_s == pytest.approx(0.365, abs=0.005)
     assert found.headroom is not None
     assert found.headroom < -0.5
-    assert follower.expected_loop_delay_s + (follower.link_delay_left_s or 0.0) == pytest.approx(0.3635, abs=4e-3)
+    assert known(follower.expected_loop_delay_s) + (follower.link_delay_left_s or 0.0) == pytest.approx(
+        0.3635, abs=4e-3
+    )
     onset = onset_of(scenario, 2)  # from a link that is past it
     assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=2e-4)  # measured: 4e-5
     assert onset.link_delay_left_s is not None
     assert onset.link_delay_left_s < -0.2
     alike = flight_plan(with_links(scenario, all=0.1))
     assert over_own_links(*alike) == alike
+
+
+def test_the_warning_of_links_that_differ_has_the_least_margin(tmp_path: Path) -> None:
+    """A fast vehicle takes less than the slowest, whose margin stands for the formation's."""
+    scenario, file = with_links(load(located("chain3_bidirectional")), all=0.02, v3=0.12), tmp_path / "unlike.toml"
+    design, _ = over_own_links(*flight_plan(scenario))
+    least_s = min(known(own.delay_margins_s[0]) for own in design.own_margins)
+    assert least_s < 0.95 * known(design.delay_margin_s)
+    file.write_text(dump(scenario), encoding="utf-8")
+    result = CliRunner().invoke(app, ["check", str(file)])
+    assert f"the least margin is {1e3 * least_s:.1f} ms" in result.stderr
 
 
 def test_flight_and_headroom_agree_over_links_that_differ() -> None:

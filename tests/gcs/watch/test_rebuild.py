@@ -199,7 +199,7 @@ def test_vehicle_sent_nothing_at_the_end_is_not_called_lost() -> None:
     assert (rebuilt.verdict, rebuilt.reason) == ("aborted", "vehicles 3 are sent nothing at the end")
 
 
-def test_a_leader_flown_by_somebody_else_is_sent_nothing_and_not_missed() -> None:
+def test_a_leader_flown_by_somebody_else_is_not_missed() -> None:
     scenario = scenario_of("chain3").model_copy(update={"course": Course(leader="external")})
     summary, rebuilt = rebuilt_with(scenario, Fleet(scenario, START_NS))
     assert (rebuilt.verdict, rebuilt.reason) == (summary.verdict, summary.reason) == ("stable", COMPLETED)
