@@ -108,13 +108,13 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
         sent_ns[due_ns].append(entered_ns)
     for entered_ns, due_ns in sorted(answered[["entered_ns", "due_ns"]].tolist()):
         left_ns[entered_ns].append(due_ns)
-    replies: list[tuple[int, int]] = []
+    replies: list[tuple[int, int, int]] = []  # replies that arrive together were sent in this order
     for at_ns, dues_ns in left_ns.items():
         if len(sent_ns[at_ns]) in (1, len(dues_ns)):  # one request may have two replies, the second a copy
-            replies += zip(dues_ns, itertools.cycle(sent_ns[at_ns]), strict=False)
+            replies += zip(dues_ns, itertools.repeat(at_ns), itertools.cycle(sent_ns[at_ns]), strict=False)
     replies.sort()
-    due = np.array([due_ns for due_ns, _ in replies], dtype=np.int64)
-    return due, np.array([(due_ns - asked_ns) * 1e-9 for due_ns, asked_ns in replies])
+    due = np.array([due_ns for due_ns, _, _ in replies], dtype=np.int64)
+    return due, np.array([(due_ns - asked_ns) * 1e-9 for due_ns, _, asked_ns in replies])
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:

@@ -11,8 +11,8 @@ and growth could be read only after a long time. A probe removes everything that
   a velocity while still on the launcher would show errors of up to v T, and asymmetric links half their asymmetry. All
   vehicles therefore share one clock and the links of the probed vehicle. Moving less than one period of delay between
   the up and down links restores the probed loop's wait for the control tick.
-* Changes of the nominal velocity, sensor noise, the failsafe, which lossy links would trigger, and the limit on the
-  spacing error, because a growing error must be observed for long enough to be measured.
+* Changes of the nominal velocity, wind, gusts, sensor and navigation noise, the failsafe, which lossy links would
+  trigger, and the limit on the spacing error, because a growing error must be observed for long enough to be measured.
 * The vehicles' limits: a clipped response is not linear, and random links push vehicles by more than an error of a
   millimetre. `past_limits` tells whether they do. Autopilots keep their limits; only the part far from them is used.
 * With autopilots, the offsets between local frames (up to 5 mm each), clocks that jump, and the start from rest: the
@@ -39,6 +39,7 @@ from gcs.plan.loops import is_modelled
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from scenarios.keys.autopilot import Sitl
+from scenarios.keys.disturbance import Disturbance
 from scenarios.keys.link import Link
 from scenarios.schema import Limits, NominalVelocity, Safety, Scenario, Vehicle
 
@@ -156,6 +157,8 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         scenario = scenario.model_copy(update={"clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})})
     elif isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
+    pushed = scenario.disturbance
+    linear = Disturbance(sector=pushed.sector) if pushed is not None and pushed.sector is not None else None
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []
     for vehicle in scenario.vehicles:
@@ -177,6 +180,8 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "vehicles": tuple(vehicles),
         "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
         "duration_s": duration_s,
+        "disturbance": linear,
+        "navigation": None,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(
             update={

@@ -7,6 +7,7 @@ import pytest
 
 from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.link import mavlink
 from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.grade import Truth, graded, true_loop_delays_s, true_round_trips
@@ -16,7 +17,7 @@ from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links, Outage
 from scenarios.schema import Clocks, FixedGains, Monitor, Safety
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.links.truth import LINK_UP, SAMPLED, MemoryRecorder
+from sim_vehicles.links.truth import DTYPE, LINK_DOWN, LINK_UP, SAMPLED, MemoryRecorder
 from sim_vehicles.services.clock import BootClock
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -78,6 +79,17 @@ def test_round_trips_are_those_of_the_links_to_the_microsecond(name: str) -> Non
         _, real = true_round_trips(truth, system_id)
         assert measured.size > 20
         assert np.abs(measured[:, None] - real[None, :]).min(axis=1).max() < 1e-6
+
+
+def test_replies_that_arrive_together_count_as_they_were_sent() -> None:
+    """The second of two requests overtakes the first, and its reply is waited for: gcs grade then matched the wrong."""
+    truth = np.zeros(4, DTYPE)
+    truth["system_id"], truth["key"] = 1, mavlink.TIMESYNC
+    truth["kind"] = LINK_DOWN, LINK_DOWN, LINK_UP, LINK_UP
+    truth["entered_ns"], truth["due_ns"] = (0, 10, 20, 30), (30, 20, 50, 50)
+    due_ns, trips_s = true_round_trips(truth, 1)
+    assert due_ns.tolist() == [50, 50]
+    assert trips_s.tolist() == pytest.approx([40e-9, 50e-9])
 
 
 @pytest.mark.parametrize("name", [name for name in GRID if name != "reordering"])
