@@ -234,12 +234,13 @@ def _percentile(values: FloatArray, percent: float) -> float | None:
 
 
 def _displaced(scenario: Scenario) -> Scenario:
+    """The scenario with initial errors, and without pushes and navigation errors, which would keep up errors."""
     vehicles = [
         vehicle.model_copy(update={"position_ne_m": (north, east + _START_ERROR_M * (k % 2))})
         for k, vehicle in enumerate(scenario.vehicles)
         for north, east in [vehicle.position_ne_m]
     ]
-    return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+    return scenario.model_copy(update={"vehicles": tuple(vehicles), "disturbance": None, "navigation": None})
 
 
 def loads_of(folder: Path, scenario: Scenario, *, resume: bool) -> Store[Load]:

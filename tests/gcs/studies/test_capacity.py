@@ -9,6 +9,7 @@ from gcs.cli.main import app
 from gcs.errors import InputError
 from gcs.studies.capacity import capacity, fly_loaded, worst_load
 from scenarios.files import load
+from scenarios.keys.disturbance import Disturbance, Gusts, Navigation
 from scenarios.schema import FixedGains, Scenario
 from tests.support.paths import SCENARIOS
 
@@ -53,6 +54,14 @@ def test_a_formation_is_judged_by_its_worst_losses(short: Scenario) -> None:
     assert worst_load(short, 10.0, 3, seeds=3) == min(alone, key=lambda load: load.headroom_p01 or 0.0)
     heavy = worst_load(short, 10.0, 8, seeds=3)
     assert heavy == fly_loaded(short, 10.0, 8), "the first that does not hold is enough"
+
+
+def test_gusts_and_navigation_errors_use_up_nothing_of_the_links(short: Scenario) -> None:
+    pushes = {
+        "disturbance": Disturbance(gusts=Gusts(deviation_m_s2=0.6, correlation_time_s=2.0)),
+        "navigation": Navigation(position_noise_m=0.3),
+    }
+    assert fly_loaded(short.model_copy(update=pushes), 10.0, 3) == fly_loaded(short, 10.0, 3)
 
 
 def test_gains_that_are_unstable_at_a_rate_are_not_flown(short: Scenario) -> None:
