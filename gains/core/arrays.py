@@ -11,6 +11,8 @@ RealArray = NDArray[np.floating[Any]]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
+_ROUGH = 1e-5
+"""Ratio of squared singular values below which the smaller one is known to fewer than ten digits."""
 
 
 def spectral_norms(matrices: NDArray[Any]) -> FloatArray:
@@ -21,11 +23,30 @@ def spectral_norms(matrices: NDArray[Any]) -> FloatArray:
     """
     if min(matrices.shape[1:]) == 1:
         return np.sqrt((np.abs(matrices) ** 2).sum(axis=(1, 2)))
-    size = 2.0 ** (np.frexp(np.abs(matrices).max(initial=0.0))[1] - 1)  # else squares may overflow
+    size, squares = _squared_singular_values(matrices)
+    return size * np.sqrt(squares[:, -1].clip(min=0.0))
+
+
+def least_singular_values(matrices: NDArray[Any]) -> FloatArray:
+    """Smallest singular value of each square matrix in a stack (k, n, n), shape (k,), to ten digits.
+
+    It is the root of the smallest eigenvalue of M'M, or comes from a decomposition where that has lost too many digits.
+    """
+    size, squares = _squared_singular_values(matrices)
+    found = size * np.sqrt(squares[:, 0].clip(min=0.0))
+    rough = squares[:, 0] < _ROUGH * squares[:, -1]
+    if rough.any():
+        found[rough] = np.linalg.svd(matrices[rough], compute_uv=False)[:, -1]
+    return found
+
+
+def _squared_singular_values(matrices: NDArray[Any]) -> tuple[float, FloatArray]:
+    """A size s, and the squared singular values of M / s, rising, of each matrix M in a stack."""
+    size = float(2.0 ** (np.frexp(np.abs(matrices).max(initial=0.0))[1] - 1))  # else squares may overflow
     matrices = matrices / size
     adjoint = matrices.conj().swapaxes(1, 2)
     squares = matrices @ adjoint if matrices.shape[1] < matrices.shape[2] else adjoint @ matrices
-    return size * np.sqrt(np.linalg.eigvalsh(squares)[:, -1].clip(min=0.0))
+    return size, np.linalg.eigvalsh(squares).astype(np.float64)
 
 
 def matrix_exponentials(generator: FloatArray, durations: FloatArray, *, less_one: bool = False) -> FloatArray:

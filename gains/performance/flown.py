@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 
 from gains.core._bracketing import highest, met_end
-from gains.core.arrays import ComplexArray, FloatArray, spectral_norms
+from gains.core.arrays import ComplexArray, FloatArray, least_singular_values, spectral_norms
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
@@ -116,8 +116,7 @@ class FlownFormation:
 
     def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
         """σ_min of the characteristic matrix at each frequency, for a loop delay (s)."""
-        sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
-        return sigma[:, -1].astype(np.float64)
+        return least_singular_values(self.characteristic(omega, delay_s))
 
     def characteristic(self, omega: FloatArray, delay_s: float) -> ComplexArray:
         """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.

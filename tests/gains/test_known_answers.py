@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gains.core._bracketing import highest
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, least_singular_values
 from gains.core.structure import is_singular_for_any_delay, real_matrix
 from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null, polished
 from gains.delay._loci import UnitCrossing, remembered
@@ -103,6 +103,16 @@ def test_the_least_singular_value_is_that_of_the_subsystem() -> None:
     least = np.linalg.svd(1j * np.eye(3) - subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
     found = least_singular_value(np.array(3.0), np.array(2.0), np.array(2.0), np.array(1.0))
     assert float(found) == pytest.approx(float(least), rel=1e-6)
+
+
+def test_least_singular_values_are_made_to_ten_digits() -> None:
+    """U diag(1, least) V' of rotations, from well-conditioned to singular, at every size of numbers."""
+    least = np.array([1.0, 1e-2, 3e-3, 1e-5, 1e-12, 0.0])
+    turned = np.array([[0.6, -0.8], [0.8, 0.6]])
+    matrices = turned @ np.stack([np.diag([1.0, value]) for value in least]) @ turned
+    for size in (1e-200, 1.0, 1e200):
+        found = least_singular_values(size * matrices) / size
+        assert found == pytest.approx(least, rel=1e-10, abs=1e-15)
 
 
 def test_a_double_pole_decays_with_its_own_rate() -> None:
