@@ -160,22 +160,6 @@ def link_delays_left_s(plan: FlightPlan, now_s: Mapping[int, float]) -> dict[int
     return left_s
 
 
-def margins_over_links_s(plan: FlightPlan) -> tuple[float, ...] | None:
-    """The margin (s) of each of the plan's gains over the scenario's links; None if the margins for equal delays apply.
-
-    If vehicles share a loop over different links, its margin is its slowest vehicle's delay when the loop breaks.
-    """
-    if plan.separable or not any(links_differ(plan, block) for block in plan_loops(plan)):
-        return None
-    expected_s, margins_s = planned_loop_delays_s(plan), list[float]()
-    for each in (replace(plan, gain=K) for K in plan.gains):
-        margins_s.append(inf)
-        for block in plan_loops(each):
-            differ, slowest_s = links_differ(each, block), max(expected_s[own] for own in block.system_ids)
-            margins_s[-1] = min(margins_s[-1], slowest_s * breaking_factor(each, block) if differ else block.margin_s())
-    return tuple(margins_s)
-
-
 def plan_over_links(plan: FlightPlan) -> FlightPlan:
     """The plan with its margins over the scenario's links, of the formation and of single vehicles.
 
