@@ -1,18 +1,17 @@
 """Code that a scenario names is run only with --allow-code, by every command that would run it."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
 
 from gcs import fly_virtual
-from gcs.cli.main import main
 from gcs.plan.own_law import OWN_LAW
 from gcs.runs.files import read_ticks
 from scenarios.files import dump
 from scenarios.own_code import write_code
 from sim_vehicles.drive.cli import run as sim_vehicles
+from tests.support.commands import exit_code
 from tests.support.fleets.own_code import LAW, coded
 
 MARKS = "from pathlib import Path\nPath('ran').touch()\n" + LAW
@@ -26,13 +25,6 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "pair.toml").write_text(dump(scenario))
     monkeypatch.chdir(tmp_path)
     return tmp_path / "pair.toml"
-
-
-def exit_code(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> object:
-    monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 @pytest.mark.parametrize(

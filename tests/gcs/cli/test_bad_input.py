@@ -1,12 +1,10 @@
 """Input that a command cannot use, as `main` meets it: one line with what was read and what was wanted, exit code 2."""
 
 import itertools
-import sys
 from pathlib import Path
 
 import pytest
 
-from gcs.cli.main import main
 from gcs.cli.options import listening, mirroring
 from gcs.errors import InputError
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE
@@ -14,6 +12,7 @@ from gcs.runs.summary import finish, summarise
 from gcs.views.observer import record_run
 from gcs.views.report import print_summary
 from scenarios.shipped import FOLDER, located
+from tests.support.commands import complaint
 from tests.support.fleets.flown_run import DESIGN, line, ticks_of, write_run
 from tests.support.paths import ROOT
 
@@ -30,16 +29,9 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    """What a command prints when it refuses its input: one line and nothing else."""
+@pytest.fixture(autouse=True)
+def _in_the_repository(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    printed = capsys.readouterr()
-    assert (ended.value.code, printed.out) == (2, "")
-    assert printed.err.count("\n") == 1
-    return printed.err
 
 
 @pytest.mark.parametrize(
@@ -87,7 +79,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
 def test_what_cannot_be_used_is_refused_before_the_work(
     arguments: str, wanted: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert wanted in complaint(capsys, monkeypatch, *arguments.format(run=run).split())
+    assert wanted in complaint(monkeypatch, capsys, *arguments.format(run=run).split())
 
 
 @pytest.mark.parametrize("options", ["--front", "--at 0.3", "--front --method graph-dk"])
@@ -97,7 +89,7 @@ def test_a_method_that_cannot_search_for_delays_is_refused(
     text = (FOLDER / "chain3_bidirectional.toml").read_text(encoding="utf-8")
     file = tmp_path / "dk.toml"
     file.write_text(text if "--method" in options else text.replace('"graph-lqr"', '"graph-dk"'), encoding="utf-8")
-    line = complaint(capsys, monkeypatch, "design", str(file), *options.split())
+    line = complaint(monkeypatch, capsys, "design", str(file), *options.split())
     assert "read method graph-dk, wanted --method inclusion or graph-lqr, with --front or --at" in line
 
 
@@ -117,7 +109,7 @@ def test_what_is_no_scenario_is_named_in_plain_words(
         binary: "read bytes that are not UTF-8 text, wanted a scenario file (see gcs new)",
     }
     for path, words in said.items():
-        assert complaint(capsys, monkeypatch, *command.split(), str(path)) == f"{path}: {words}\n"
+        assert complaint(monkeypatch, capsys, *command.split(), str(path)) == f"{path}: {words}\n"
 
 
 def test_a_folder_does_not_hide_a_shipped_scenarios_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,10 +141,10 @@ def test_a_damaged_file_of_a_run_is_named_by_recover(
 ) -> None:
     finish(run)
     (run / name).write_bytes(DAMAGED[what])
-    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+    assert f"run/{name}: " in complaint(monkeypatch, capsys, "recover", str(run))
     (run / name).unlink()
     (run / name).mkdir()
-    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+    assert f"run/{name}: " in complaint(monkeypatch, capsys, "recover", str(run))
 
 
 @pytest.mark.parametrize("what", DAMAGED)
@@ -162,7 +154,7 @@ def test_a_damaged_file_of_a_run_is_named_by_replay(
 ) -> None:
     finish(run)
     (run / name).write_bytes(DAMAGED[what])
-    assert f"run/{name}: " in complaint(capsys, monkeypatch, "replay", str(run))
+    assert f"run/{name}: " in complaint(monkeypatch, capsys, "replay", str(run))
 
 
 @pytest.mark.parametrize("what", DAMAGED)
@@ -172,7 +164,7 @@ def test_replay_and_monitor_name_a_design_they_cannot_read(
     design = run / "other.json"
     design.write_bytes(DAMAGED[what])
     for command in (("replay", str(run)), ("monitor", "--listen", "127.0.0.1:0")):
-        assert "run/other.json: " in complaint(capsys, monkeypatch, *command, "--design", str(design))
+        assert "run/other.json: " in complaint(monkeypatch, capsys, *command, "--design", str(design))
 
 
 @pytest.mark.parametrize("what", ["bytes", "nothing", "another JSON", "of no kind", "a folder", "not there"])
@@ -183,7 +175,7 @@ def test_an_unreadable_truth_log_is_named_by_grade(
         (run / TRUTH_FILE).mkdir()
     elif what != "not there":
         (run / TRUTH_FILE).write_bytes(b"UAVTRUE2" + bytes(400) if what == "of no kind" else DAMAGED[what])
-    assert TRUTH_FILE in complaint(capsys, monkeypatch, "grade", str(run))
+    assert TRUTH_FILE in complaint(monkeypatch, capsys, "grade", str(run))
 
 
 def test_ticks_of_unknown_vehicles_are_refused(
@@ -191,7 +183,7 @@ def test_ticks_of_unknown_vehicles_are_refused(
 ) -> None:
     text = (run / SCENARIO_FILE).read_text(encoding="utf-8")
     (run / SCENARIO_FILE).write_text(text.replace("system_id = 1\n", "system_id = 9\n"), encoding="utf-8")
-    assert "read ticks of vehicles [1]" in complaint(capsys, monkeypatch, "recover", str(run))
+    assert "read ticks of vehicles [1]" in complaint(monkeypatch, capsys, "recover", str(run))
 
 
 @pytest.mark.parametrize(("listens", "mirror"), [("127.0.0.1", "localhost"), ("0.0.0.0", "127.0.0.1")])
@@ -204,7 +196,7 @@ def test_a_picture_is_a_png_within_the_recording(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refusal(*options: str) -> str:
-        return complaint(capsys, monkeypatch, "view", str(run), *options)
+        return complaint(monkeypatch, capsys, "view", str(run), *options)
 
     finish(run)
     record_run(run)
@@ -231,10 +223,10 @@ def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFi
 def test_an_empty_connect_does_not_start_vehicles(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "--connect: read '', wanted HOST:PORT" in complaint(capsys, monkeypatch, "fly", CHAIN, "--connect", "")
+    assert "--connect: read '', wanted HOST:PORT" in complaint(monkeypatch, capsys, "fly", CHAIN, "--connect", "")
 
 
 def test_a_name_too_long_for_a_file_is_refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "File name too long, wanted" in complaint(capsys, monkeypatch, "view", "a" * 300)
+    assert "File name too long, wanted" in complaint(monkeypatch, capsys, "view", "a" * 300)

@@ -1,13 +1,11 @@
 """A user's first steps: new scenarios, checks of what they would fly, and flights in virtual time."""
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gcs.cli.main import main
 from gcs.plan.planner import flight_plan
 from gcs.preflight.check import check
 from gcs.runs.files import read_ticks
@@ -17,17 +15,9 @@ from gcs.watch.tlog import parse_tlog
 from scenarios.files import load, parse
 from scenarios.schema import Scenario
 from scenarios.shipped import columns, copied, names
+from tests.support.commands import exit_code
 
 pytestmark = pytest.mark.xdist_group("processes")  # flights start an observer process
-
-
-def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
-    """The exit code of a command."""
-    monkeypatch.setattr(sys, "argv", ["gcs", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 @pytest.mark.parametrize("name", names())
@@ -54,8 +44,8 @@ def test_a_check_shows_the_commands_of_the_first_tick(tmp_path: Path, monkeypatc
     """On the launcher vehicles report 25 m/s and do not move. Extrapolation thus errs by up to one period of that speed
     in every spacing error, times K3 = 5.6 1/s²."""
     monkeypatch.chdir(tmp_path)
-    assert gcs(monkeypatch, "new", "five.toml", "--chain", "5") == 0
-    assert gcs(monkeypatch, "fly", "five.toml", "--virtual", "--out", "run", "--json") == 0
+    assert exit_code(monkeypatch, "new", "five.toml", "--chain", "5") == 0
+    assert exit_code(monkeypatch, "fly", "five.toml", "--virtual", "--out", "run", "--json") == 0
     expected = {v.system_id: v.command_m_s2 for v in check(flight_plan(load(Path("five.toml")))[1]).vehicles}
     ticks = read_ticks(tmp_path / "run")
     first = ticks[ticks["commanded"]][: len(expected)]
@@ -66,9 +56,9 @@ def test_a_check_shows_the_commands_of_the_first_tick(tmp_path: Path, monkeypatc
 
 def test_a_virtual_flight_leaves_the_files_of_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert gcs(monkeypatch, "new", "trio.toml") == 0
+    assert exit_code(monkeypatch, "new", "trio.toml") == 0
     for folder in ("one", "two"):
-        assert gcs(monkeypatch, "fly", "trio.toml", "--virtual", "--out", folder, "--json") == 0
+        assert exit_code(monkeypatch, "fly", "trio.toml", "--virtual", "--out", folder, "--json") == 0
     files = {file.name for file in Path("one").iterdir()}
     assert files == {
         "design.json", "events.jsonl", "flight.rrd", "flight.tlog", "report.html", "scenario.toml", "summary.json",
@@ -88,9 +78,9 @@ def test_names_of_shipped_scenarios_are_accepted_in_place_of_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert gcs(monkeypatch, "scenarios", "--json") == 0
+    assert exit_code(monkeypatch, "scenarios", "--json") == 0
     assert list(json.loads(capsys.readouterr().out)["scenarios"]) == names()
-    assert gcs(monkeypatch, "check", "chain3", "--json") == 0
+    assert exit_code(monkeypatch, "check", "chain3", "--json") == 0
     assert json.loads(capsys.readouterr().out)["delay_margin_s"] == pytest.approx(0.3)
 
 
@@ -108,7 +98,7 @@ def test_check_says_between_which_delays_a_predicted_loop_is_stable(
     monkeypatch.chdir(tmp_path)
     text = copied("triangle5", "mine").replace("[control]", f"[control]\nprediction = {prediction}")
     Path("mine.toml").write_text(text)
-    assert gcs(monkeypatch, "check", "mine.toml") == 0
+    assert exit_code(monkeypatch, "check", "mine.toml") == 0
     assert f"delay    loop 50.0 ± 10.0 ms expected from the links, {wanted}\n" in capsys.readouterr().out
 
 
@@ -138,7 +128,7 @@ def test_unusable_arguments_are_refused_in_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("there.toml").touch()
-    assert gcs(monkeypatch, *arguments.split()) == 2
+    assert exit_code(monkeypatch, *arguments.split()) == 2
     printed = capsys.readouterr().err
     assert wanted in printed
     assert printed.count("\n") == 1
@@ -152,6 +142,6 @@ def test_check_names_a_response_that_simulated_autopilots_do_not_have(
     given = "\n[response]\nlag_s = {}\nvelocity_gain_1_s = 2.0\n"
     for lag_s, differs in ((0.1, True), (0.15, False)):
         file.write_text(copied("copters5", "copters") + given.format(lag_s), encoding="utf-8")
-        assert gcs(monkeypatch, "check", file) == 0
+        assert exit_code(monkeypatch, "check", file) == 0
         line = "response lag_s 0.1, for which the control is designed: the simulated autopilots have 0.15"
         assert (line in capsys.readouterr().out) == differs

@@ -7,24 +7,18 @@ from xml.etree import ElementTree
 
 import pytest
 
-from gcs.cli.main import main
 from scenarios.files import dump, load
 from scenarios.keys.link import Link, Links, Outage, VehicleLinks
+from tests.support.commands import complaint, exit_code
 from tests.support.paths import SCENARIOS
 
 pytestmark = pytest.mark.xdist_group("processes")  # flights start an observer process
 
 
-def fly(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str | Path, links: Links | None = None
-) -> int | str | None:
+def fly(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str | Path, links: Links | None = None) -> int:
     file, scenario = folder / "chain3.toml", load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 4.0})
     file.write_text(dump(scenario if links is None else scenario.model_copy(update={"links": links})))
-    arguments = [file, "--virtual", "--json", "--out", folder / "run", *options]
-    monkeypatch.setattr("sys.argv", ["gcs", "fly", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
+    return exit_code(monkeypatch, "fly", file, "--virtual", "--json", "--out", folder / "run", *options)
 
 
 def test_assertions_that_hold_pass(
@@ -90,13 +84,8 @@ def test_a_check_is_a_gate_on_the_expected_headroom(
 ) -> None:
     """chain3 has a margin of 300 ms and 60 ms of loop delay at most, over links of 20 ms each way: 80 %."""
 
-    def checked(least: str) -> int | str | None:
-        monkeypatch.setattr("sys.argv", ["gcs", "check", "chain3", "--json", "--assert-headroom", least])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code
-
-    assert [checked("0.8"), checked("0.82"), checked("2")] == [0, 1, 2]
+    gate = "check", "chain3", "--json", "--assert-headroom"
+    assert [exit_code(monkeypatch, *gate, least) for least in ("0.8", "0.82", "2")] == [0, 1, 2]
     failed, refused = capfd.readouterr().err.splitlines()
     assert failed == "failed: --assert-headroom: read 80.0% for 99 % of the set-points, wanted at least 82%"
     assert refused == "--assert-headroom: read 2, wanted a number from -1000 to 1"
@@ -106,9 +95,5 @@ def test_a_check_is_no_gate_for_autopilots_not_yet_identified(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Their margin is 600 ms if they respond at once, 445 ms with their actual response."""
-    monkeypatch.setattr("sys.argv", ["gcs", "check", "copters5", "--link-delay", "0.23", "--assert-headroom", "0.1"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    out, err = capfd.readouterr()
-    assert (ended.value.code, out, err.count("\n")) == (2, "", 1)
-    assert "read autopilots that are identified in flight, wanted a [response] in the scenario" in err
+    refused = complaint(monkeypatch, capfd, "check", "copters5", "--link-delay", "0.23", "--assert-headroom", "0.1")
+    assert "read autopilots that are identified in flight, wanted a [response] in the scenario" in refused

@@ -5,20 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from gcs.cli.main import main
 from gcs.runs.summary import finish
 from gcs.views.observer import recover_run
 from gcs.views.report import print_summary
 from scenarios.files import dump, load
+from tests.support.commands import exit_code
 from tests.support.fleets.flown_run import line, ticks_of, write_run
 from tests.support.paths import SCENARIOS
-
-
-def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int | str | None:
-    monkeypatch.setattr("sys.argv", ["gcs", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
@@ -77,7 +70,7 @@ def test_missing_extra_is_named_in_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     without(monkeypatch, module)
-    assert gcs(monkeypatch, *command.format(run=run, scenarios=SCENARIOS).split()) == 2
+    assert exit_code(monkeypatch, *command.format(run=run, scenarios=SCENARIOS).split()) == 2
     printed = capsys.readouterr().err
     assert wanted in printed
     assert printed.count("\n") == 1
@@ -90,7 +83,7 @@ def test_campaign_without_matplotlib_has_a_report_without_figures(
     file = tmp_path / "short.toml"
     file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0})), encoding="utf-8")
     out = tmp_path / "out"
-    assert gcs(monkeypatch, "stress", file, "--delay", "0.1", "--workers", "1", "--out", out) == 0
+    assert exit_code(monkeypatch, "stress", file, "--delay", "0.1", "--workers", "1", "--out", out) == 0
     printed = capsys.readouterr().err
     assert "no figures: the package matplotlib is not installed" in printed
     assert "flights  2, 24 s in all: about " in printed

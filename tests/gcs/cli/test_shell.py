@@ -10,9 +10,10 @@ from typing import NoReturn
 import pytest
 from typer.testing import CliRunner
 
-from gcs.cli.main import app, main
+from gcs.cli.main import app
 from scenarios.files import dump, load
 from scenarios.schema import Control, FixedGains
+from tests.support.commands import exit_code
 from tests.support.paths import SCENARIOS
 
 
@@ -36,7 +37,7 @@ def test_check_of_an_unstable_loop_prints_json_that_parses(
     unstable = tmp_path / "unstable.toml"
     control = Control(gains=FixedGains(K1=1.0, K2=0.0, K3=1.0))
     unstable.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"control": control})), encoding="utf-8")
-    assert gcs(monkeypatch, "check", str(unstable), "--allow-unstable", "--json") == 0
+    assert exit_code(monkeypatch, "check", str(unstable), "--allow-unstable", "--json") == 0
     found = json.loads(capsys.readouterr().out, parse_constant=refuse)
     assert (found["schema_version"], found["delay_margin_s"], found["headroom"]) == (1, 0.0, None)
 
@@ -47,18 +48,11 @@ def refuse(constant: str) -> NoReturn:
 
 def test_new_scenario_names_the_schema_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "mine.toml"
-    assert gcs(monkeypatch, "new", str(file)) == 0
+    assert exit_code(monkeypatch, "new", str(file)) == 0
     first = file.read_text(encoding="utf-8").splitlines()[0]
     assert first == "#:schema ./scenario.schema.json"
     assert "properties" in json.loads((tmp_path / "scenario.schema.json").read_text(encoding="utf-8"))
     assert load(file).name == "mine"
-
-
-def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
-    monkeypatch.setattr("sys.argv", ["gcs", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
 
 
 def test_no_command_is_cut_in_the_list_of_commands() -> None:

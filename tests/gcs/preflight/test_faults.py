@@ -2,19 +2,19 @@
 
 import itertools
 import json
-import sys
 from math import hypot
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from gcs.cli.main import app, main
+from gcs.cli.main import app
 from gcs.plan.planner import flight_plan
 from gcs.preflight.faults import bad_start, endless_link, unstable_loop, without_actions
 from gcs.runs.summary import summarise
 from scenarios.files import load
 from scenarios.keys.link import DelayPoint, Link, Links
+from tests.support.commands import complaint
 from tests.support.paths import ROOT
 
 CHAIN = load(ROOT / "scenarios/chain3.toml")
@@ -42,16 +42,6 @@ def with_gains(folder: Path, K1: float, K2: float, K3: float) -> Path:
     return chain_file(folder, ("delay_margin_s = 0.3", f"gains = {{K1 = {K1!r}, K2 = {K2!r}, K3 = {K3!r}}}"))
 
 
-def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
-    monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    printed = capsys.readouterr()
-    assert (ended.value.code, printed.out) == (2, "")
-    assert printed.err.count("\n") == 1
-    return printed.err
-
-
 @pytest.mark.parametrize(
     "command", [("design",), ("fly", "--virtual"), ("stress", "--onset"), ("design", "--loop", "onboard")]
 )
@@ -77,7 +67,7 @@ def test_an_unstable_loop_is_refused_with_its_root(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = with_gains(tmp_path, *gains)
-    line = complaint(capsys, monkeypatch, command[0], str(file), *command[1:])
+    line = complaint(monkeypatch, capsys, command[0], str(file), *command[1:])
     number = file.read_text(encoding="utf-8")[: file.read_text(encoding="utf-8").index("gains = ")].count("\n") + 1
     assert line.startswith(f"{file}: line {number}: control.gains: read a loop that ")
     assert wanted in line
@@ -131,13 +121,13 @@ def test_starts_in_collision_or_past_the_limit_are_found_beforehand(
 ) -> None:
     near = chain_file(tmp_path, ("[-242.79, 243.09]", "[-122.82, 125.52]"))
     for command in (("fly", "--virtual"), ("stress", "--onset"), ("bench",), ("compare",)):
-        line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
+        line = complaint(monkeypatch, capsys, command[0], str(near), *command[1:])
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
         assert line.startswith(f"{near}: line {line_of_vehicle(near, 3)}: vehicle 3: position_ne_m: ")
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
     far = chain_file(tmp_path, ("[-242.79, 243.09]", "[-2242.79, 243.09]"))
     assert "vehicle 3: position_ne_m: read a spacing error of 1998" in complaint(
-        capsys, monkeypatch, "fly", str(far), "--virtual"
+        monkeypatch, capsys, "fly", str(far), "--virtual"
     )
 
 
@@ -145,20 +135,20 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(ROOT / "scenarios/chain3.toml")
-    line = complaint(capsys, monkeypatch, "fly", file, "--virtual", "--link-delay", "40")
+    line = complaint(monkeypatch, capsys, "fly", file, "--virtual", "--link-delay", "40")
     assert line == (
         f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s that the station "
         "waits for an answer\n"
     )
     out = str(tmp_path / "stress")
-    line = complaint(capsys, monkeypatch, "stress", file, "--delay", "0.1,30", "--out", out)
+    line = complaint(monkeypatch, capsys, "stress", file, "--delay", "0.1,30", "--out", out)
     assert "read a round trip of 30 s to vehicle 1" in line
     assert not (tmp_path / "stress").exists()
     late = str(chain_file(tmp_path, ("delay_s = 0.02", "delay_s = 40.0")))
     for command in ("bench", "compare", "capacity"):
-        assert "read a round trip of 80 s to vehicle 1" in complaint(capsys, monkeypatch, command, late)
+        assert "read a round trip of 80 s to vehicle 1" in complaint(monkeypatch, capsys, command, late)
     number = Path(late).read_text(encoding="utf-8").splitlines().index("[links]") + 1
-    assert complaint(capsys, monkeypatch, "check", late).startswith(f"{late}: line {number}: links: read a round trip")
+    assert complaint(monkeypatch, capsys, "check", late).startswith(f"{late}: line {number}: links: read a round trip")
     assert endless_link(CHAIN.with_link_delay(up_s=9.9, down_s=9.9)) is None
     short = CHAIN.with_link_delay(up_s=3.0, down_s=3.0).model_copy(update={"duration_s": 6.0})
     assert "wanted less than duration_s = 6 s" in (endless_link(short) or "")
@@ -191,7 +181,7 @@ def test_links_that_let_nothing_through_are_refused(
 ) -> None:  # fmt: skip
     file = str(chain_file(tmp_path, *changes))
     for command in (("check",), ("fly", "--virtual")):
-        assert wanted in complaint(capsys, monkeypatch, *command, file)
+        assert wanted in complaint(monkeypatch, capsys, *command, file)
 
 
 def test_places_nearer_than_a_collision_are_refused() -> None:

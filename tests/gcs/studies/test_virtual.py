@@ -11,6 +11,7 @@ from gcs.runs.files import read_ticks
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load
 from scenarios.schema import Control, FixedGains
+from tests.support.commands import exit_code
 from tests.support.paths import SCENARIOS
 
 
@@ -19,15 +20,11 @@ from tests.support.paths import SCENARIOS
 def test_python_and_the_command_fly_the_same_bits(
     control: Control, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gcs.cli.main import main
-
     scenario = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0, "control": control})
     flight = gcs.fly_virtual(scenario)
     file = tmp_path / "chain3.toml"
     file.write_text(dump(scenario))
-    monkeypatch.setattr("sys.argv", ["gcs", "fly", str(file), "--virtual", "--out", str(tmp_path / "run"), "--json"])
-    with pytest.raises(SystemExit):
-        main()
+    exit_code(monkeypatch, "fly", file, "--virtual", "--out", tmp_path / "run", "--json")
     assert flight.ticks.tobytes() == read_ticks(tmp_path / "run").tobytes()
     assert flight.table().num_rows == flight.ticks.size
     assert (flight.design.for_link is None) == (control.for_link == "off")

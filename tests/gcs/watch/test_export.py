@@ -8,13 +8,13 @@ import pyarrow.csv
 import pytest
 from mcap.reader import make_reader
 
-from gcs.cli.main import main
 from gcs.drive.flown import fly_plan
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.record import TLOG_FILE
 from gcs.watch.tlog import read_tlog
 from scenarios.files import load
+from tests.support.commands import exit_code
 from tests.support.paths import SCENARIOS
 
 
@@ -26,18 +26,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def export(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int | str | None:
-    monkeypatch.setattr("sys.argv", ["gcs", "export", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return ended.value.code
-
-
 def test_a_run_as_mcap_holds_every_value_of_every_tick(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "run.mcap"
-    assert export(monkeypatch, run, "--mcap", file) == 0
+    assert exit_code(monkeypatch, "export", run, "--mcap", file) == 0
     ticks, events = read_ticks(run), RunTail(run).events()
     with file.open("rb") as opened:
         reader = make_reader(opened)
@@ -62,7 +55,7 @@ def test_a_run_as_mcap_holds_every_value_of_every_tick(
 def test_exported_times_are_on_one_clock_without_jumps(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert export(monkeypatch, run, "--csv", tmp_path / "csv") == 0
+    assert exit_code(monkeypatch, "export", run, "--csv", tmp_path / "csv") == 0
     rows = pyarrow.csv.read_csv(tmp_path / "csv" / "ticks.csv")
     times_ns = np.unique(rows["time_ns"].to_numpy())
     assert set(np.diff(times_ns).tolist()) == {20_000_000}  # 50 Hz, also where scenario time leaps to 0
@@ -73,7 +66,10 @@ def test_exported_times_are_on_one_clock_without_jumps(
 
 
 def test_a_log_as_csv_has_one_file_per_message_kind(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert export(monkeypatch, run / TLOG_FILE, "--csv", tmp_path / "csv", "--mcap", tmp_path / "log.mcap") == 0
+    assert (
+        exit_code(monkeypatch, "export", run / TLOG_FILE, "--csv", tmp_path / "csv", "--mcap", tmp_path / "log.mcap")
+        == 0
+    )
     rows = 0
     for file in (tmp_path / "csv").iterdir():
         rows += pyarrow.csv.read_csv(file).num_rows
@@ -107,7 +103,7 @@ def test_what_cannot_be_exported_is_reported_in_one_line(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert export(monkeypatch, *(text.format(run=run) for text in arguments)) == 2
+    assert exit_code(monkeypatch, "export", *(text.format(run=run) for text in arguments)) == 2
     _, err = capsys.readouterr()
     assert wanted in err
     assert err.count("\n") == 1
