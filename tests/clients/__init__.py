@@ -1,1 +1,1 @@
-"""Clients of other makers against the simulated vehicles: MAVSDK, signed and unsigned, and MAVProxy."""
+"""Third-party clients fly the simulated vehicles: MAVSDK, signed and unsigned, and MAVProxy."""

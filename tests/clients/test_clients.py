@@ -1,9 +1,9 @@
-"""Clients that are too large for every installation fly our vehicles: MAVProxy, and MAVSDK by way of its server.
+"""Optional clients, too large for every installation, fly our vehicles: MAVProxy, and MAVSDK through its server.
 
-`python3 make.py clients` installs them and runs this; without them these tests are skipped.
+`python3 make.py clients` installs them and runs these tests, which are skipped without them.
 """
 
-import asyncio  # noqa: TID251 - the client's
+import asyncio  # noqa: TID251 - the MAVSDK client is asynchronous
 import math
 import os
 import re
@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 
 
 class Console:
-    """MAVProxy without a screen: lines in, and what it writes."""
+    """MAVProxy in a process of its own: takes command lines, and collects the output."""
 
     def __init__(self, port: int, folder: Path) -> None:
         assert MAVPROXY is not None
@@ -48,13 +48,13 @@ class Console:
         self._process.communicate()
 
     def say(self, command: str) -> None:
-        """Give a command."""
+        """Send a command line."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{command}\n".encode())
         self._process.stdin.flush()
 
     def expect(self, pattern: str, command: str = "", *, repeat_s: float = PATIENCE_S) -> None:
-        """Give a command, again after a while, until it has written this since."""
+        """Wait for a pattern in new output; until it comes, send a command, if given, every `repeat_s`."""
         begin, end_s, said_s = len(self.written), time.monotonic() + PATIENCE_S, -PATIENCE_S
         assert self._process.stdout is not None
         file_number = self._process.stdout.fileno()
@@ -86,7 +86,7 @@ def test_mavproxy_lists_sets_arms_takes_off_and_flies_without_complaint(console:
     console.expect(r"Mode GUIDED", "mode GUIDED")
     console.expect(r"(?m)^ARMED", "arm throttle")
     console.expect(r"NAV_TAKEOFF: ACCEPTED", "takeoff 5")
-    # each command is one set-point in the frame of the body, which faces north
+    # each command is one set-point in the body frame, and the vehicle faces north
     console.expect(r"vx : (1\.0|0\.9[5-9])", "velocity 1 0 0\nstatus LOCAL_POSITION_NED", repeat_s=0.5)
     console.expect(r"Mode BRAKE", "mode BRAKE")
     for kind, name in (("wp", "waypoints"), ("fence", "fence items"), ("rally", "rally items")):
@@ -96,24 +96,24 @@ def test_mavproxy_lists_sets_arms_takes_off_and_flies_without_complaint(console:
 
 
 async def first(stream: Any, wanted: Callable[[Any], bool]) -> Any:
-    """What a stream of the client says first that is wanted."""
-    async for told in stream:
-        if wanted(told):
-            return told
+    """The first value of a client's stream that is `wanted`."""
+    async for value in stream:
+        if wanted(value):
+            return value
     raise AssertionError
 
 
-def is_connected(told: Any) -> bool:
-    return told.is_connected
+def is_connected(state: Any) -> bool:
+    return state.is_connected
 
 
-def is_up(told: Any) -> bool:
-    return told.relative_altitude_m > 1.0
+def is_up(position: Any) -> bool:
+    return position.relative_altitude_m > 1.0
 
 
 def flies(north_m_s: float, east_m_s: float) -> Callable[[Any], bool]:
-    def at_that_velocity(told: Any) -> bool:
-        return math.dist((told.north_m_s, told.east_m_s), (north_m_s, east_m_s)) < 0.1
+    def at_that_velocity(velocity: Any) -> bool:
+        return math.dist((velocity.north_m_s, velocity.east_m_s), (north_m_s, east_m_s)) < 0.1
 
     return at_that_velocity
 
@@ -137,7 +137,7 @@ def test_the_mavsdk_server_takes_off_and_flies_a_velocity(tmp_path: Path) -> Non
     mavsdk: Any = pytest.importorskip("mavsdk_grpc", reason=f"mavsdk-grpc {HINT}")
     offboard: Any = pytest.importorskip("mavsdk_grpc.offboard")
     whole = copters()
-    alone = whole.model_copy(update={"vehicles": whole.vehicles[:1]})  # the server shows one, whichever it finds first
+    alone = whole.model_copy(update={"vehicles": whole.vehicles[:1]})  # the server exposes the first that it finds
     with fleet(alone, tmp_path) as port:
         server = Path(mavsdk.__file__).parent / "bin" / "mavsdk_server"
         with subprocess.Popen([server, "-p", str(port), f"udpin://127.0.0.1:{port}"]) as process:  # TCP, and UDP

@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 
 
 class Client:
-    """MAVSDK at a port, with what it has found there."""
+    """MAVSDK on a port, with the systems that it found there and their telemetry."""
 
     def __init__(self, port: int) -> None:
         self.mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
@@ -149,8 +149,8 @@ def test_velocities_are_flown_in_both_frames_before_hold_and_return(client: Clie
         until(lambda number=number: client.mode(number) == FlightMode.RETURN_TO_LAUNCH, "return to launch")
 
 
-def take_over_and_say_so(port: int) -> None:
-    """What the process does that is killed: take a double integrator in flight under control."""
+def take_control_and_report(port: int) -> None:
+    """Fly a double integrator in OFFBOARD and wait: runs in the process that is killed."""
     client = Client(port)
     action = Action(client.systems[2])
     action.arm()
@@ -169,7 +169,7 @@ def take_over_and_say_so(port: int) -> None:
 
 def test_a_vehicle_holds_when_its_client_is_killed(tmp_path: Path) -> None:
     with fleet(files.load(SCENARIOS / "triangle5.toml"), tmp_path) as port:
-        # as a module: a file would not find the package that it is in
+        # as a module: run as a file, it would not find its own package
         command = [sys.executable, "-m", "tests.clients.test_mavsdk", str(port)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=SCENARIOS.parent) as process:
             assert process.stdout is not None
@@ -189,4 +189,4 @@ def test_a_vehicle_holds_when_its_client_is_killed(tmp_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    take_over_and_say_so(int(sys.argv[1]))
+    take_control_and_report(int(sys.argv[1]))

@@ -1,8 +1,8 @@
-"""MAVSDK and signed vehicles: it has no key of its own, and flies them where its bytes are signed for it."""
+"""MAVSDK and signed vehicles: it cannot sign itself, and flies them only if its bytes are signed for it."""
 
 import socket
 import threading  # noqa: TID251 - MAVSDK has threads of its own
-import time  # noqa: TID251 - and a clock
+import time  # noqa: TID251 - and a clock of its own
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ def a_client(connection: str) -> Any:
 
 
 class SignedBytes:
-    """What MAVSDK sends and receives on a raw connection, signed and verified on one socket, as by an application."""
+    """The application's part: signs what MAVSDK sends on a raw connection, and verifies what it receives."""
 
     def __init__(self, client: Any, port: int, key_file: Path) -> None:
         self.refused: Counter[str] = Counter()
@@ -51,7 +51,7 @@ class SignedBytes:
     def send(self, data: bytes) -> None:
         with self._lock:
             signed = self._link.sign(data, time.monotonic_ns())
-            for address in self._vehicles:  # each takes what is for it
+            for address in self._vehicles:  # each vehicle takes only what is addressed to it
                 self._socket.sendto(signed, address)
 
     def run(self) -> None:
@@ -73,7 +73,7 @@ def test_mavsdk_commands_signed_vehicles_only_through_a_connection_that_signs(tm
     make_key(key_file)
     with fleet(copters(), tmp_path, "--key", str(key_file)) as port:
         plain = a_client(f"udpin://127.0.0.1:{port}")
-        until(lambda: plain.system_count() == 5, "five systems")  # it hears them: it looks at no signature
+        until(lambda: plain.system_count() == 5, "five systems")  # it hears them: it checks no signature
         with pytest.raises(ActionError):
             Action(plain.get_systems()[0]).arm()
         plain.destroy()
