@@ -55,7 +55,7 @@ def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) ->
 
 
 @shared
-def test_the_announced_time_of_a_sweep_has_the_take_off() -> None:
+def test_the_announced_time_of_a_sweep_includes_the_take_off() -> None:
     flight = usual("ardupilot")
     start_s = flight.flown["due_ns"].min() * 1e-9 - START_NS * 1e-9
     assert start_and_speed(planned("ardupilot"), seconds=1.0)[0] == pytest.approx(start_s, abs=0.1)
@@ -64,9 +64,9 @@ def test_the_announced_time_of_a_sweep_has_the_take_off() -> None:
 @shared
 def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
     flight = usual("ardupilot")
-    # the last positions in the scenario's frame, braking by then in the same way
+    # the last positions, in the scenario's frame; by then all vehicles brake alike
     place = {k: np.array(pair(flight.copter(k).motion.place_m)) for k in (1, 2, 3)}
-    assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are said to 11 mm
+    assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are reported to 11 mm
     down_m = flight.flown["down_m"][-3:]
     assert np.ptp(down_m) == pytest.approx(0.0, abs=0.1)  # all at 20 m above one ground
     assert place[3] - place[2] == pytest.approx([-12.0, 12.0], abs=0.05)
@@ -149,7 +149,7 @@ def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
 
 
 @pytest.mark.slow(first=0)
-def test_margin_in_resisting_air_is_that_of_the_velocity_flown() -> None:
+def test_margin_with_drag_is_that_of_the_velocity_flown() -> None:
     resisted, still = three(drag_1_m=0.06), (NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0)),)
     short = resisted.model_copy(update={"duration_s": 1.0})
     margin_s, at_rest_s = (
@@ -164,7 +164,7 @@ def test_margin_in_resisting_air_is_that_of_the_velocity_flown() -> None:
 @pytest.mark.slow(first=2)
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_start_up_goes_through_losses_and_refusals(flavour: str, seed: int) -> None:
+def test_start_up_survives_losses_and_refusals(flavour: str, seed: int) -> None:
     lossy = Link(delay_s=0.03, loss_probability=0.15)
     scenario = three(flavour=flavour, arming_refusals=3, up_down=lossy).model_copy(update={"seed": seed})
     flight = fly(plan_for(scenario))
@@ -230,7 +230,7 @@ def test_a_clock_jump_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> 
     ("again", "end"), [(False, "completed: duration reached"), (True, "not identified: vehicle 3 ")]
 )
 def test_a_disturbed_manoeuvre_is_flown_once_more(again: bool, end: str) -> None:
-    # set-points that are lost for a second, in the first manoeuvre or in both
+    # set-points are lost for 1.5 s, in the first manoeuvre or in both
     times_s = (20.7, 28.0) if again else (20.7,)
     silent = Link(delay_s=0.02, outages=tuple(Outage(from_s=s, until_s=s + 1.5) for s in times_s))
     links = COPTERS5.links.model_copy(
@@ -309,7 +309,7 @@ def fly_with_a_pilot(flavour: str, modes: dict[float, int], *, system_id: int = 
     for tick in fly_lockstep(station.plan, station=station, vehicles=fleet):
         ticks.append(tick)
         if wanted and tick["time_s"][0] > wanted[0][0]:
-            # what a switch of its remote control does is the command, without a link
+            # a switch of the pilot's remote control acts as this command, but needs no link
             vehicle, (_, mode) = fleet.vehicle(system_id), wanted.popleft()
             packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
             vehicle.step([(command(176, 1, *packed, system=system_id), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
@@ -326,7 +326,7 @@ def test_a_second_station_takes_over_airborne_vehicles() -> None:
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_told_to_land_at_the_end_they_do(flavour: str) -> None:
+def test_copters_told_to_land_at_the_end_do(flavour: str) -> None:
     flight = fly(plan_for(three(flavour=flavour, duration_s=3.0).model_copy(update={"at_end": "land"})))
     end_ns = int(flight.ticks["due_ns"][-1])
     flight.fleet.step([], end_ns + 60_000_000_000)
@@ -373,7 +373,7 @@ def test_a_gimbal_with_the_same_system_id_is_no_vehicle() -> None:
 
 
 def test_vehicle_reporting_no_motion_is_not_blamed_for_its_telemetry() -> None:
-    """Vehicle 3 always reports the velocity 0."""
+    """Vehicle 3 always reports zero velocity."""
 
     def at_rest(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
         message = parse(data)

@@ -19,8 +19,8 @@ def test_a_vehicle_landed_by_its_pilot_stays_disarmed_in_guided(flavour: str) ->
     landed_s = began_s + 27.0
     modes = {began_s + 5.0: rules.land_mode, landed_s: rules.guided_mode}
     scenario = flown(flavour).model_copy(update={"duration_s": 45.0})
-    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
-    own = PilotsVehicle(pilots, flavour, modes)
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own = PilotsVehicle(fleet, flavour, modes)
     error_m = 0.0
     for tick in fly_lockstep(station.plan, station=station, vehicles=own):
         since_s = (int(tick["due_ns"][0]) - START_NS) / SECOND

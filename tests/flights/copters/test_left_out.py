@@ -23,7 +23,7 @@ DEAD = Link(loss_probability=1.0)
 
 
 def lacking(system_id: int, link: Link = DEAD, *, patience_s: float = 20.0, **changes: Any) -> Scenario:
-    """Three copters, of which one is on a link of its own."""
+    """Three copters, one of them on a link of its own, which by default loses every datagram."""
     scenario = three(**changes)
     own = VehicleLinks(system_id=system_id, up=link, down=link)
     return scenario.model_copy(
@@ -44,7 +44,7 @@ def test_others_fly_without_a_vehicle_that_is_never_heard(flavour: str) -> None:
     assert flight.station.end_reason == "left out: vehicles 3"
     assert verdict(flight.station.end_reason, 1.0) == "aborted"  # a gate must notice
     assert flight.error_m(2)[-1] < 0.17
-    assert 27.0 < began_s(flight) < 37.0  # the patience, and run-up and manoeuvre of those that are there
+    assert 27.0 < began_s(flight) < 37.0  # the patience, then run-up and manoeuvre of the others
     found, others = flight.station.plan, fly(plan_for(three(duration_s=1.0))).station.plan
     assert found.responses is not None
     assert sorted(found.responses.of) == [1, 2]
@@ -71,7 +71,7 @@ def test_without_the_leader_the_others_hold_the_nominal_velocity() -> None:
 
 
 def test_a_vehicle_that_fell_silent_climbing_is_left_alone() -> None:
-    """It may be anywhere: it is not counted as a collision, and commanded nothing when it is heard again."""
+    """It may be anywhere: it counts in no collision, and is sent no command when it is heard again."""
     gone = Link(delay_s=0.02, outages=(Outage(from_s=6.0, until_s=40.0),))
     scenario = lacking(3, gone, duration_s=30.0).model_copy(update={"response": TRUTH})
     flight = fly(plan_for(scenario))
@@ -79,18 +79,18 @@ def test_a_vehicle_that_fell_silent_climbing_is_left_alone() -> None:
     assert not flight.ticks["commanded"][flight.ticks["system_id"] == 3].any()
     assert "is left out: is silent" in flight.texts("vehicle")
     assert LEFT_OUT in flight.texts("vehicle")
-    assert flight.copter(3).mode == flight.copter(3).rules.hold_mode  # at the end it is told to hold, as the others
+    assert flight.copter(3).mode == flight.copter(3).rules.hold_mode  # at the end it is told to hold, like the others
 
 
 def test_a_left_out_vehicle_that_is_heard_is_not_lost() -> None:
-    """It hears nothing, so that it does not arm."""
+    """It is heard but hears nothing itself, so that it never arms."""
     scenario = lacking(3, duration_s=1.0)
     deaf = VehicleLinks(system_id=3, down=Link(delay_s=0.02, outages=(Outage(from_s=2.0, until_s=1e6),)))
     links = scenario.links.model_copy(update={"vehicles": (deaf,)})
     flight = fly(plan_for(scenario.model_copy(update={"links": links})))
     assert flight.station.end_reason == "left out: vehicles 3"
     modes = flight.flown["mode"][flight.flown["system_id"] == 3]
-    assert (modes[1:] == Mode.FAILSAFE).all()  # modes are those of the phase before, at the first tick
+    assert (modes[1:] == Mode.FAILSAFE).all()  # the first tick still has the modes of the phase before
 
 
 def test_nobody_ready_is_no_flight() -> None:

@@ -1,4 +1,4 @@
-"""A vehicle that its pilot flies is the pilot's, whatever else happens to it, until it reports that it is guided."""
+"""A vehicle that its pilot has taken over stays the pilot's, whatever happens, until it reports its guided mode."""
 
 from collections.abc import Callable
 
@@ -27,7 +27,7 @@ def fly(
     fleet: Fleet | None = None,
     start_ns: int = START_NS,
 ) -> tuple[Station, PilotsVehicle]:
-    """Fly until the end, or so long after the start."""
+    """Fly until the end, or until `until_s` after the start."""
     station = Station(plan_for(scenario), start_ns=start_ns)
     pilots = PilotsVehicle(fleet or Fleet(scenario, START_NS), flavour, modes)
     if change is not None:
@@ -72,7 +72,7 @@ def test_a_silence_that_ends_takes_no_vehicle_from_its_pilot(flavour: str) -> No
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_an_old_heartbeat_after_a_silence_overrides_no_pilot(flavour: str) -> None:
-    """What a link held back, or somebody recorded: guided, from before the pilot took over."""
+    """A link held it back, or somebody recorded it: it shows guided mode, from before the pilot took over."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     kept: list[bytes] = []
 
@@ -93,8 +93,8 @@ def test_an_old_heartbeat_after_a_silence_overrides_no_pilot(flavour: str) -> No
 def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
-    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
-    ticks = fly_lockstep(station.plan, station=station, vehicles=PilotsVehicle(pilots, flavour, {began_s + 2.0: mode}))
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    ticks = fly_lockstep(station.plan, station=station, vehicles=PilotsVehicle(fleet, flavour, {began_s + 2.0: mode}))
     for tick in ticks:
         if tick["time_s"][0] > 5.0:
             break
@@ -114,7 +114,8 @@ def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_th
     began_s = flight_s(flavour)
     mode, end_s = PILOTS_MODE[flavour], began_s + 20.0
     lossy = VehicleLinks(system_id=2, up=Link(delay_s=0.02, outages=(Outage(from_s=end_s - 1.0, until_s=1e6),)))
-    links = COPTERS5.links.model_copy(update={"vehicles": (lossy,), "times_from": "start"})  # the end takes its 6 s
+    # vehicle 2 is not heard at the end, which therefore takes its full 6 s
+    links = COPTERS5.links.model_copy(update={"vehicles": (lossy,), "times_from": "start"})
     scenario = flown(flavour).model_copy(update={"links": links})
     station, pilots = fly(scenario, flavour, {end_s + after_the_end_s: mode})
     assert station.end_reason
@@ -125,7 +126,7 @@ def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_th
 @pytest.mark.parametrize("mode", [POSCTL, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24, 4 << 16 | 3 << 24])
 @pytest.mark.parametrize("at_s", [5.0, 6.0])
 def test_a_px4_pilot_intervening_before_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
-    """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
+    """During the climb. One of the pilot's choices is the hold mode in which a take-off also ends."""
     station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
     flown_by = "has landed and is not armed again", "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
     assert station.vehicles[2].missing == flown_by[pilots.copter.armed]
@@ -148,8 +149,8 @@ def test_a_pilot_intervening_after_release_is_left_alone(flavour: str) -> None:
     """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
-    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
-    own = PilotsVehicle(pilots, flavour, {})
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own = PilotsVehicle(fleet, flavour, {})
     for tick in fly_lockstep(station.plan, station=station, vehicles=own):
         since_s = (int(tick["due_ns"][0]) - START_NS) / SECOND - began_s
         vehicle = station.vehicles[2]
@@ -162,7 +163,7 @@ def test_a_pilot_intervening_after_release_is_left_alone(flavour: str) -> None:
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
-    """The first was killed; the second knows nothing of what was before."""
+    """The first was killed; the second knows nothing of what happened before."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
     _, first = fly(scenario, flavour, {began_s + 3.0: mode}, until_s=began_s + 5.0)
@@ -174,7 +175,7 @@ def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
             break
     assert station.vehicles[2].taken_over
     assert_left_alone(first, mode)
-    # and given back it goes on
+    # once the vehicle is given back, the flight goes on
     first.modes[(second_ns - START_NS) / SECOND + 20.0] = RULES[flavour].guided_mode
     for tick in fly_lockstep(station.plan, station=station, vehicles=first):
         if tick["due_ns"][0] > second_ns + 37 * SECOND:
@@ -194,10 +195,10 @@ def test_an_abandoned_flight_leaves_its_vehicles_holding(flavour: str) -> None:
 
 
 def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
-    """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
+    """An ACK outweighs heartbeats sent before it, but not a heartbeat with a new mode."""
     scenario = flown("ardupilot")
-    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
-    own, vehicle, answered_s = PilotsVehicle(pilots, "ardupilot", {}), station.vehicles[2], 0.0
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own, vehicle, answered_s = PilotsVehicle(fleet, "ardupilot", {}), station.vehicles[2], 0.0
     for tick in fly_lockstep(station.plan, station=station, vehicles=own):
         if vehicle.guided and own.reached_ns == 0:
             answered_s = (int(tick["due_ns"][0]) - START_NS) / SECOND
@@ -228,5 +229,5 @@ def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     assert vehicle.guided
     assert heartbeat(0, armed=False, at_s=1.4) == (4, True)
     assert heartbeat(4, armed=False, at_s=1.5) == (4, True)
-    assert heartbeat(5, armed=True, at_s=1.6) == (5, True)  # which it was not in before: that is news
+    assert heartbeat(5, armed=True, at_s=1.6) == (5, True)  # a mode that it was not in before is new
     assert heartbeat(0, armed=False, at_s=3.0) == (0, False)

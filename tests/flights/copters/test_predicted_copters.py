@@ -1,4 +1,4 @@
-"""Prediction with the response of autopilots: they fly at three times the delay that their gains take without it."""
+"""Prediction with the response of autopilots: they fly at three times the delay that their gains tolerate."""
 
 from dataclasses import replace
 from functools import cache
@@ -24,7 +24,7 @@ from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
 from tests.support.known import known
 
 ASSUMED_S = 1.2
-# what copters5 is designed to for a margin of 0.4 s with this response
+# the design of copters5 for a margin of 0.4 s with this response
 GAINS = FixedGains(K1=-1.898, K2=0.0, K3=1.642)
 
 
@@ -85,7 +85,7 @@ def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
     assert plain_s == pytest.approx(static_s, abs=0.0005)
     assert predicted_s > 3.0 * static_s
     assert predicted_1_s == pytest.approx(wanted_1_s, rel=0.01)
-    # two roots nearly meet: 1 ms more delay takes 2 % of the decay
+    # two roots nearly meet: 1 ms more delay costs 2 % of the decay
     assert plain_1_s == pytest.approx(wanted_1_s, rel=0.02)
     assert known(ways[0].string_peak) > 1.3
     assert {way.string_peak for way in ways[1:]} == {1.0}
@@ -113,7 +113,7 @@ def test_copters_take_the_gains_for_their_measured_link() -> None:
     assert known(predicted.alpha) > 1.3 * known(plain.alpha)
     plan = flight_plan(chosen)[1]
     assert not plan.tolerance(0.41).longer_s[0] < 0.02 / 0.7
-    # as the whole map of these vehicles tells
+    # the same limits from the loop of the whole formation
     assert predicted.stable_s is not None
     least_s, most_s = predicted.stable_s[0], known(predicted.stable_s[1])
     loop = formation_loop(plan.model, plan.gain, plan.responses_in_order)
@@ -131,9 +131,9 @@ def test_without_prediction_the_same_copters_drift_apart() -> None:
 
 
 def settled_then_slower(plan: FlightPlan, aside_s: float) -> Flight:
-    """First 20 s with the assumed delay, until errors are those of telemetry; then past the end of the window.
+    """Fly 20 s at the assumed delay, until only telemetry noise is left, and then `aside_s` past the end of the window.
 
-    From larger errors the limits of acceleration and jerk lead to an oscillation of constant size, here 0.3 m.
+    Larger errors would meet the limits of acceleration and jerk, and end in an oscillation of constant size: 0.3 m.
     """
     slower_s = (ASSUMED_S + plan.tolerance(ASSUMED_S).longer_s[0] + aside_s) / 2.0 - 0.005
     points = tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in ((20.0, 0.595), (20.5, slower_s)))
@@ -149,7 +149,7 @@ def test_copters_beyond_their_window_grow_apart_as_computed() -> None:
     delay_s = float(np.median(flight.flown["loop_delay_s"][flight.flown["time_s"] > 30.0]))
     growth_1_s = predicted_growth_rate(*loop, plan.timing, assumed_s=ASSUMED_S, delay_s=delay_s, measured=measured)
     error_m = flight.error_m(2)
-    peaks_m = error_m[: error_m.size // 200 * 200].reshape(-1, 200).max(axis=1)[8:]  # of 4 s, two oscillations
+    peaks_m = error_m[: error_m.size // 200 * 200].reshape(-1, 200).max(axis=1)[8:]  # each of 4 s, two oscillations
     grows = (peaks_m > 2e-4) & (peaks_m < 5e-2)  # above the noise of telemetry, below the limits
     assert np.count_nonzero(grows) > 3
     flown_1_s = float(np.polyfit(4.0 * np.flatnonzero(grows), np.log(peaks_m[grows]), 1)[0])

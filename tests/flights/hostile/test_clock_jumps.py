@@ -1,4 +1,4 @@
-"""Flights in which boot clocks are set: nothing is extrapolated over the jump, and no figure is made up from it."""
+"""Flights in which boot clocks are set: nothing is extrapolated over the jump, and no figure is made from it."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -76,7 +76,7 @@ def test_clock_jumps_neither_end_a_flight_nor_show_in_figures(by_s: float, times
 
 
 def test_known_offsets_are_within_their_bound_at_every_tick() -> None:
-    """But for the round trip in which only the vehicle knows that its clock has been set back."""
+    """Except in the round trip in which only the vehicle knows that its clock has been set."""
     flight = flown(clock_jumps=(ClockJump(at_s=45.0, by_s=3.0),), timesync_hz=0.2)
     rows = flight.ticks[flight.ticks["system_id"] == 2]
     rows = rows[np.isfinite(rows["clock_offset_s"])]
@@ -89,7 +89,7 @@ def test_known_offsets_are_within_their_bound_at_every_tick() -> None:
 
 
 class BackdatedReplies:
-    """A fleet whose TIMESYNC replies are dated back as ArduCopter does it."""
+    """A fleet that backdates its TIMESYNC replies as ArduCopter does."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
@@ -114,8 +114,8 @@ def ticks_of(scenario: Scenario, vehicles: BackdatedReplies, station: Station) -
     return fly_lockstep(replace(planned(), scenario=scenario), station=station, vehicles=vehicles)
 
 
-def test_replies_that_are_dated_back_are_not_taken_for_jumps() -> None:
-    """ArduCopter dates them back by up to 3.5 ms; on direct links up to half of the exchanges contradict the rest."""
+def test_backdated_replies_are_not_taken_for_jumps() -> None:
+    """ArduCopter backdates them by up to 3.5 ms; on direct links up to half of the exchanges contradict the rest."""
     direct = column(clock_jumps=()).model_copy(update={"links": Links(up=Link(delay_s=1e-4), down=Link(delay_s=1e-4))})
     station, vehicles = (
         Station(replace(planned(), scenario=direct), start_ns=START_NS),

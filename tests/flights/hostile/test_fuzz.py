@@ -4,9 +4,9 @@
 flight; a sample is sent by default. The flight lasts as long as that takes: a step gets no more than the emulated links
 hold.
 
-Without a key, new valid frames from the station's or a vehicle's own address, and replays older than the 128 frames
-that a sequence number can tell apart, are not meant: those cannot be told from the real ones. What they must not do is
-raise anything, which is a test of its own.
+Without a key, two kinds of frames cannot be told from real ones and are left out: new valid frames from the station's
+or a vehicle's own address, and replays older than the 128 frames that a sequence number can tell apart. They must still
+raise nothing, which is a test of its own.
 """
 
 import math
@@ -55,7 +55,7 @@ from tests.support.paths import SCENARIOS
 
 COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "20000"))
 BATCH = min(3000, max(100, COUNT // 1800 * 10))
-"""To each end at each step: three links hold 10,000 datagrams each, and what is sent in two steps is under way."""
+"""Datagrams to each end at each step. Three links hold 10,000 each, and those of two steps are under way at a time."""
 SECONDS = max(4.0, math.ceil(COUNT / BATCH / 50) + 1.0)
 COUNTERS = ["received", "lost", "late", "duplicate"]
 CHAIN3 = load(SCENARIOS / "chain3.toml")
@@ -73,7 +73,7 @@ def scenario_of(kind: str, seconds: float) -> Scenario:
 
 @dataclass
 class Fire:
-    """What is sent to both ends at each step, made from what passed lately."""
+    """Hostile datagrams for both ends at each step, made from what passed lately."""
 
     system_ids: list[int]
     signed: bool
@@ -101,7 +101,7 @@ class Fire:
         return fired
 
     def at_vehicles(self, now_ns: int) -> list[tuple[int, bytes, int]]:
-        """All that does not pass for a message of the station to a vehicle."""
+        """Anything that no vehicle can take for a message of the station."""
         if self.fired["vehicles"] >= COUNT or len(self.down) < 50:
             return []
         tenth, rng = BATCH // 10, self.rng
@@ -110,7 +110,8 @@ class Fire:
         if self.signed:
             data += extreme(rng, tenth, SAID_BY_STATIONS, source=255, targets=self.system_ids)
         fired = [(self.system_ids[k % 3], one, now_ns) for k, one in enumerate(data)]
-        if self.signed:  # each to the vehicle that it was for: a heartbeat is as good for another that has heard less
+        if self.signed:
+            # each to the vehicle that it was for: another that has heard fewer frames would accept a heartbeat
             fired += [(*self.down[k], now_ns) for k in rng.integers(len(self.down), size=tenth).tolist()]
         self.fired["vehicles"] += len(fired)
         return fired
@@ -144,7 +145,8 @@ def flown(plan: FlightPlan, fire: Fire | None, key: Key | None) -> tuple[TickArr
         if tick is not None:
             ticks.append(station.complete(tick, [now_ns] * len(outgoing)))
             station.frames.clear()
-    for system_id in fleet.system_ids:  # vehicles live when something of theirs is due: now all have heard the same
+    # vehicles advance only when something is due: this brings all to the same instant
+    for system_id in fleet.system_ids:
         fleet.state(system_id, station.next_event_ns)
     return np.concatenate(ticks), station, fleet
 
@@ -154,7 +156,7 @@ def refused(counters: Counter[str]) -> int:
 
 
 def of_the_flight(station: Station) -> list[Event]:
-    """The events without the words that frames came twice: replays have."""
+    """The events, except reports of duplicate frames, which replays cause."""
     return [event for event in station.events if event.kind != "link"]
 
 
@@ -176,7 +178,7 @@ def test_a_flight_under_fire_is_the_flight_without_it(kind: str, key: Key | None
     fire = Fire(list(plan.formation.system_ids), key is not None)
     hit, station, fleet = flown(plan, fire, key)
     assert min(fire.fired["station"], fire.fired["vehicles"]) > 0.9 * COUNT
-    assert fleet.counters["link_down_dropped"] == 0  # nothing of the station's gave way to what was fired
+    assert fleet.counters["link_down_dropped"] == 0  # no datagram of the station was dropped for what was fired
     for name in hit.dtype.names or ():
         if name not in COUNTERS:
             np.testing.assert_array_equal(hit[name], calm[name], err_msg=name)
@@ -185,18 +187,18 @@ def test_a_flight_under_fire_is_the_flight_without_it(kind: str, key: Key | None
         vehicle.clock.unmatched + vehicle.frames.duplicate + vehicle.frames.late for vehicle in station.vehicles
     )
     counted = station.counters.total() + unmatched
-    assert counted > 0.8 * fire.fired["station"]  # what is refused bears a name
+    assert counted > 0.8 * fire.fired["station"]  # what is refused is counted by name
     for name in ("setpoints", "heartbeats"):
         assert fleet.counters[name] == calm_fleet.counters[name]
     assert refused(fleet.counters) - refused(calm_fleet.counters) >= 0.95 * fire.fired["vehicles"]
     replays = "replayed" if key is not None else ""
-    assert hit["duplicate"].max() + hit["late"].max() + station.counters[replays] > 0  # they were seen to be replays
+    assert hit["duplicate"].max() + hit["late"].max() + station.counters[replays] > 0  # replays were recognised
 
 
 @pytest.mark.parametrize("kind", ["plain", "onboard", "ardupilot", "px4"])
 @pytest.mark.parametrize("from_second", [0, 3])
 def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_second: int) -> None:
-    """Without a key the flight is lost to who speaks as a vehicle or as the station does; the programs are not."""
+    """Without a key, whoever speaks as a vehicle or as the station can ruin a flight, but must not crash a program."""
     _, plan = flight_plan(scenario_of(kind, 4.0))
     rng, ids = np.random.default_rng(from_second), list(plan.formation.system_ids)
     station, fleet = Station(plan, start_ns=START_NS), Fleet(plan.scenario, START_NS)
@@ -208,7 +210,7 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
         if now_ns >= START_NS + from_second * 10**9:
             for own in ids:
                 frames = extreme(rng, 2, SAID_BY_VEHICLES, source=own, targets=[0, 255, own])
-                if own in asked:  # only an answer to what was asked is looked at
+                if own in asked:  # replies are read only if they answer a request
                     tc1_ns = int(rng.choice([-(2**63), -1, 1, 2**62 - 1, 2**63 - 1]))
                     frames.insert(0, timesync_reply(tc1_ns, asked.pop(own), own, 200))
                 frames += [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]

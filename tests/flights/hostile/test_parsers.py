@@ -24,7 +24,7 @@ HEARTBEAT_2 = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=7)
 HEARTBEAT_1 = vehicles_mavlink.in_version_1(
     vehicles_mavlink.Encoder(new_place()).heartbeat(4, armed=False, flying=True, critical=False)
 )
-"""Shorter than most, with a checksum that is right: what follows it is read as well."""
+"""Shorter than most frames. Its checksum is right, so that parsers go on to what follows it."""
 SIGNED = SignedLink(KEY, link_id=0, crc_extra=mavlink.CRC_EXTRA, epoch_ns=0, stamps=Stamps()).sign(HEARTBEAT_2, 0)
 FRAMES = (HEARTBEAT_1, HEARTBEAT_2, SIGNED)
 PIECES = st.one_of(

@@ -1,4 +1,4 @@
-"""Signed flights in virtual time, and what gets in, at both ends: the same bytes as on real sockets."""
+"""Signed flights in virtual time, with the same bytes as on real sockets, and what either end lets in."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -47,7 +47,7 @@ def a_fleet(plan: FlightPlan, key: bytes | None = KEY) -> Fleet:
 
 @dataclass
 class Attacked:
-    """Vehicles and what an attacker who hears every datagram sends to either end, from the right addresses."""
+    """Vehicles, and an attacker who hears every datagram and sends to both ends, from the right addresses."""
 
     fleet: Fleet
     up: list[tuple[int, bytes]] = field(default_factory=list[tuple[int, bytes]])
@@ -111,7 +111,7 @@ def test_a_signed_flight_is_the_unsigned_flight_bit_by_bit() -> None:
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_signed_copters_start_and_fly(flavour: Flavour) -> None:
-    """A PX4, which otherwise speaks MAVLink 1 until it is spoken to, is heard as well."""
+    """Among them a PX4, which without signing speaks MAVLink 1 until it hears MAVLink 2."""
     scenario = load(SCENARIOS / "copters5.toml")
     autopilot = scenario.autopilot.model_copy(update={"flavour": flavour})
     response = Response(lag_s=0.15, velocity_gain_1_s=2.0)
@@ -145,7 +145,7 @@ def test_attacks_at_both_ends_do_not_change_a_signed_flight() -> None:
     ("fleet_key", "station_key", "reason"),
     [(None, KEY, "unsigned"), (OTHER_KEY, KEY, "wrong signature"), (KEY, None, "")],
 )
-def test_ends_that_do_not_have_one_key_do_not_fly(fleet_key: Any, station_key: Any, reason: str) -> None:
+def test_ends_without_a_common_key_do_not_fly(fleet_key: Any, station_key: Any, reason: str) -> None:
     plan = a_plan("chain3", 1.0)
     fleet = a_fleet(plan, fleet_key)
     ticks, station = flown(plan, fleet, a_guard(station_key) if station_key else None)
@@ -167,7 +167,7 @@ def test_reordering_links_cost_frames_but_look_like_no_attack() -> None:
     counters = fleet.counters
     assert station.counters["overtaken"] > 100
     assert station.counters["replayed"] == counters["link_up_duplicated"]
-    # Flipped bits of a frame's last 13 bytes show in no checksum: a signature of which not all may be attacks.
+    # Flipped bits in a frame's last 13 bytes, its signature, show in no checksum: not all of these are attacks.
     assert station.counters["wrong signature"] <= counters["link_up_corrupted"]
     assert counters["refused_overtaken"] > 100
     assert counters["refused_replayed"] <= counters["link_down_duplicated"]
