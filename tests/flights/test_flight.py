@@ -45,7 +45,7 @@ def flown(plan: FlightPlan, design: Design, station: Station | None = None, **kw
 
 
 class Without:
-    """The vehicles of a scenario, with the links of some of them cut from a time on."""
+    """The vehicles of a scenario, with the links of some of them cut from `from_ns` until `until_ns`."""
 
     def __init__(self, scenario: Scenario, cut: set[int], *, from_ns: int, until_ns: int = 2**62) -> None:
         self.fleet = Fleet(scenario, START_NS)
@@ -114,7 +114,7 @@ def test_above_the_margin_the_formation_breaks_leaving_vehicles_in_failsafe() ->
 
 
 def dominant_growth_1_s(ticks: TickArray, system_id: int) -> float:
-    """Growth rate of a follower's spacing error: slope of the log of its peaks over the middle of the flight."""
+    """Growth rate of a follower's spacing error: slope of the log of its peaks after the first 10 s."""
     rows = ticks[(ticks["system_id"] == system_id) & (ticks["time_s"] > 10.0)]
     error = rows["spacing_error_east_m"]
     peaks = np.flatnonzero((np.abs(error[1:-1]) >= np.abs(error[:-2])) & (np.abs(error[1:-1]) > np.abs(error[2:]))) + 1
@@ -256,7 +256,7 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
     plan, design = planned("chain3", control=control, monitor=Monitor(act=False), limits=Limits())
-    assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
+    assert design.margins_s[0] < 0.05  # exceeded by 40 ms of link delay and the waiting of at least one vehicle
     _, summary = flown(plan, design)
     assert max(known(v.loop_delay_s.p50) for v in summary.vehicles) > design.margins_s[0]
     assert (summary.verdict, summary.settling_time_s) == ("unstable", None)
@@ -335,10 +335,10 @@ def test_a_wide_start_flown_at_three_g_comes_together() -> None:
         (300.0, False, "broken: spacing error of vehicle 5 is 301 m, limit 300 m"),
     ],
 )
-def test_tolerance_or_a_passive_station_breaks_triangle5_far_above_margin(
+def test_a_tight_limit_or_passive_monitor_breaks_triangle5_above_margin(
     limit_m: float, acts: bool, reason: str
 ) -> None:
-    """With time to change to slower gains the monitor saves it: what scenarios/triangle5.toml says of its limit."""
+    """Given time to change to slower gains, the monitor saves it, as scenarios/triangle5.toml says at its limit."""
     plan, design = planned("triangle5", monitor=Monitor(act=acts))
     late = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
     safety = late.safety.model_copy(update={"spacing_error_limit_m": limit_m})
@@ -354,7 +354,7 @@ def test_tolerance_or_a_passive_station_breaks_triangle5_far_above_margin(
 
 @pytest.mark.parametrize("name", ["triangle5", "copters5"])
 def test_flights_make_no_garbage_to_collect(name: str) -> None:
-    """In real time collections are off. A campaign flies thousands in one process, in which they are rare."""
+    """In real time garbage collection is off. It is rare in a campaign, which flies thousands in one process."""
     plan, _ = planned(name, duration_s=1.0)
 
     def stations_left() -> int:

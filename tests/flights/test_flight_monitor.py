@@ -136,7 +136,7 @@ def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
         if e.kind in ("mode", "gains")
     ]
     assert sum("gain set" in change for change in changes) > 5
-    parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # checksum and layout: theirs
+    parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # pymavlink's check
     messages: list[Any] = [message for some in parsed for message in some]
     told = [message for message in messages if message.get_type() == "STATUSTEXT"]
     # Messages about changes in the flight's last tick are not seen here.

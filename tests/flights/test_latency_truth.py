@@ -1,4 +1,4 @@
-"""Measured latencies against what the emulated links and vehicles wrote down, in virtual time, over a grid of links."""
+"""Measured latencies against what the emulated links and vehicles recorded, in virtual time, over a grid of links."""
 
 from functools import cache
 
@@ -82,7 +82,7 @@ def test_round_trips_are_those_of_the_links_to_the_microsecond(name: str) -> Non
 
 
 def test_replies_that_arrive_together_count_as_they_were_sent() -> None:
-    """The second of two requests overtakes the first, and its reply is waited for: gcs grade then matched the wrong."""
+    """The second request overtakes the first, and replies arrive together: gcs grade once matched the wrong ones."""
     truth = np.zeros(4, DTYPE)
     truth["system_id"], truth["key"] = 1, mavlink.TIMESYNC
     truth["kind"] = LINK_DOWN, LINK_DOWN, LINK_UP, LINK_UP
@@ -94,7 +94,7 @@ def test_replies_that_arrive_together_count_as_they_were_sent() -> None:
 
 @pytest.mark.parametrize("name", [name for name in GRID if name != "reordering"])
 def test_every_round_trip_is_in_the_ticks(name: str) -> None:
-    """Those of all replies, but for the last of a flight."""
+    """The round trips of all replies, except the last few of a flight."""
     ticks, truth = flown(name)
     for system_id in (1, 2, 3):
         measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]

@@ -31,7 +31,7 @@ IDS = {1: 1, 2: 2, 3: 1001, 4: 1002, 5: 9002}
 """Vehicles 1 and 2 of networks 0 and 1, and a vehicle 2 of network 9."""
 _OWN: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
 HEARTBEAT: bytes = _OWN.heartbeat_encode(2, 3, 1, 0, 3).pack(_OWN)
-"""Of a vehicle 2."""
+"""From a vehicle 2, in whichever network."""
 
 
 def renumbered(duration_s: float, **changes: Any) -> Scenario:
@@ -124,7 +124,7 @@ def test_the_benchmarks_formation_fills_one_network_after_the_other() -> None:
         ("fly wrong.toml", "line 17: vehicle 1251: system_id: read 1251, wanted at most 250, or 1001 to 1250 in"),
     ],
 )
-def test_what_networks_cannot_do_is_one_line(
+def test_what_networks_cannot_do_is_refused_in_one_line(
     arguments: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

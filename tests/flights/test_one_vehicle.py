@@ -23,7 +23,7 @@ LONE = Scenario(
 
 
 def flown(scenario: Scenario) -> tuple[Design, Summary]:
-    """Design and summary."""
+    """Design and summary of a flight whose monitor only watches."""
     calm = scenario.model_copy(update={"monitor": scenario.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
     flight = fly_plan(plan)

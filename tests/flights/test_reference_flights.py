@@ -54,7 +54,7 @@ END_TOLERANCE = 1e-3
 class Reference:
     sha256: str
     end: tuple[tuple[float, ...], ...]
-    """What the station knows last of each vehicle, in the order of the formation: north, east, and their velocities."""
+    """The last state of each vehicle that the station knows, in the order of the formation: north, east, velocities."""
 
 
 REFERENCES: dict[str, Reference] = {
@@ -172,7 +172,7 @@ def test_another_process_flies_the_same_to_the_last_bit(other: dict[str, str]) -
 
 
 def print_references() -> None:
-    """As Python source, to be put above."""
+    """Print all references as Python source, to be put above."""
     for name in REFERENCES:
         reference = reference_of(flown(name))
         print(f'    "{name}": Reference(\n        sha256="{reference.sha256}",\n        end=(')

@@ -1,1 +1,1 @@
-"""Whole flights with other loops than the plain one: predicted, on board, manoeuvring, disturbed, of one's own."""
+"""Whole flights with other loops than the plain one: predicted, on board, manoeuvring, disturbed, user-supplied."""

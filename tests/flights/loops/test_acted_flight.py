@@ -20,7 +20,7 @@ from tests.support.paths import SCENARIOS
 
 FAST, SLOW = FixedGains(K1=-3.408, K2=0.631, K3=5.608), FixedGains(K1=-1.898, K2=0.0, K3=1.642)
 REPORT = b"\x55\x00\x00"
-"""Message id of POSITION_TARGET_LOCAL_NED, as a frame has it."""
+"""Message id of POSITION_TARGET_LOCAL_NED, as in a frame."""
 
 
 class Unheard:
@@ -48,7 +48,7 @@ def rms(error_m: FloatArray) -> float:
 
 
 def stepped(base: Scenario, gains: FixedGains, *, link_s: float, step_m_s: float) -> Scenario:
-    """At 10 Hz; the nominal velocity changes at 4 s."""
+    """The scenario at 10 Hz, with a step of the nominal velocity at 4 s."""
     north, east = base.nominal_velocity_at(0.0)
     faster = NominalVelocity(from_s=4.0, velocity_ne_m_s=(north + step_m_s, east))
     link = Link(delay_s=link_s)
@@ -78,10 +78,10 @@ def copters(flavour: str) -> Scenario:
     ids=["launched", "ardupilot", "px4"],
 )
 def test_losses_disturb_less_when_vehicles_report_what_acted(make: Callable[[], Scenario], share: float) -> None:
-    """20 % of the set-points lost: rms difference of the spacing errors from those of the flight without losses.
+    """With 20 % of the set-points lost: rms difference of the spacing errors from those of the flight without losses.
 
-    Reports reduce it to 98 % of that without, from 0.176 m, for our own vehicles; to 76 % of 0.0123 m for ArduPilot's
-    stand-in and 71 % of 0.0125 m for PX4's.
+    Reports reduce it to a share of its value without them: for our own vehicles to 98 % of 0.176 m, for simulated
+    ArduPilots to 76 % of 0.0123 m, and for simulated PX4s to 71 % of 0.0125 m.
     """
     plan = flight_plan(make())[1]
     found: dict[bool, list[float]] = {False: [], True: []}
@@ -99,7 +99,7 @@ def test_losses_disturb_less_when_vehicles_report_what_acted(make: Callable[[], 
 
 
 def test_clipping_that_only_vehicles_know_of_is_learnt() -> None:
-    """They can do 3 m/s², the station believes 29.4, at 1 s of loop delay.
+    """The vehicles can do 3 m/s², while the station believes 29.4; the loop delay is 1 s.
 
     After 10 s the errors are 0.025 mm rms with reports, and a limit cycle of 0.67 m without.
     """

@@ -1,4 +1,4 @@
-"""Disturbed formations in flight against what is computed for them."""
+"""Disturbed formations: what is flown against what is computed."""
 
 import numpy as np
 import pytest
@@ -112,5 +112,5 @@ def test_flown_spread_of_copters_is_the_computed_one() -> None:
     )
     assert flown.summary.spread is not None
     ratios = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) for own in flown.summary.spread.vehicles]
-    # in 120 s flown and computed agree within 3 %; without what gusts do to the velocity owed, 1.4 would be predicted
+    # in 120 s flown and computed agree within 3 %; a model without gusts in the velocity deficit would give 1.4
     assert ratios == pytest.approx([1.0, 1.0], abs=0.1)

@@ -1,4 +1,4 @@
-"""Flights with a share of the command in front: errors do not pass down the chain, and the margin stays the same."""
+"""Flights that feed forward a share of the command in front: errors do not grow down the chain; the margin is kept."""
 
 from functools import cache
 
@@ -25,7 +25,7 @@ K1, K3 = 3.408, 5.608
 
 
 def scenario(share: float, K2: float | None) -> Scenario:
-    """With given gains, or with K2 None designed ones."""
+    """With given gains, or with designed ones if K2 is None."""
     wanted = {"delay_margin_s": 0.3} if K2 is None else {"gains": FixedGains(K1=-K1, K2=K2, K3=K3)}
     control = Control.model_validate(wanted | {"feed_forward": share})
     return CHAIN.model_copy(update={"control": control})
@@ -37,7 +37,7 @@ def planned(share: float, K2: float) -> FlightPlan:
 
 
 def stepped(share: float, K2: float | None, *, link_s: float, leader_m_s: float = 0.0) -> TickArray:
-    """A flight in place, whose nominal velocity changes by 2 m/s; or whose leader alone begins that much faster."""
+    """A flight in place: the nominal velocity steps by 2 m/s, or with `leader_m_s` = 2 the leader alone is faster."""
     speed = CHAIN.nominal_velocity[0].velocity_ne_m_s[0]
     steps = tuple(
         NominalVelocity(from_s=t, velocity_ne_m_s=(v, 0.0)) for t, v in ((0.0, speed), (2.0, speed + 2.0 - leader_m_s))
@@ -64,7 +64,7 @@ def peaks_m(ticks: TickArray) -> list[float]:
 
 
 def sizes_m(ticks: TickArray) -> list[float]:
-    """The root mean square of the spacing error of each follower, in the order of the chain: gains bound that."""
+    """The rms spacing error of each follower, in the order of the chain: string peaks bound how this grows."""
     flown = ticks[ticks["time_s"] > 0.5]  # the first set-points have arrived
     error = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
     return [float(np.sqrt((error[flown["system_id"] == v.system_id] ** 2).mean())) for v in CHAIN.leader_first()[1:]]

@@ -205,13 +205,13 @@ def test_a_delay_that_no_gains_tolerate_is_refused() -> None:
 
 
 def static_decay_1_s(way: GainsAtDelay, first: float = 1.0, last: float = 1.0, *, share: float = 1.0) -> float:
-    """Of the sampled loop, with parts of K1 and K3, at a share of the delay."""
+    """Decay rate of the sampled loop, with K1 times `first` and K3 times `last`, at a share of the delay."""
     K = ScalarGains(-first * known(way.K1), 0.0, last * known(way.K3), 0.0).K
     return -growth_rate(PAIR.A, PAIR.B, K, period_s=PERIOD_S, delay_s=share * way.loop_delay_s)
 
 
 def test_prediction_tolerates_longer_delays_at_equal_decay() -> None:
-    """Two static gains and a delay: (2 - sqrt 2) / decay is the longest, docs/explanation/prediction.md."""
+    """Two static gains tolerate (2 - sqrt 2) / decay at most: docs/explanation/prediction.md."""
     design = flight_plan(load(SCENARIOS / "triangle5.toml"))[0]
     plain, *predicted = compared(design, "triangle5").ways
     decays = [known(way.decay_rate_1_s) for way in predicted]
@@ -226,7 +226,7 @@ def test_prediction_tolerates_longer_delays_at_equal_decay() -> None:
     assert all(known(way.alpha) < known(plain.alpha) for way in predicted)
     near = 0.99975143, 0.99941735  # the best of a simplex search with the sampled loop
     decays = (static_decay_1_s(plain, share=1.1), static_decay_1_s(plain), static_decay_1_s(plain, *near))
-    assert decays == pytest.approx((1.08, 1.62, 1.73), abs=0.005)  # the digits of the page
+    assert decays == pytest.approx((1.08, 1.62, 1.73), abs=0.005)  # the figures of that page
     assert max(known(way.decay_rate_half_way_1_s) for way in predicted) < 0.65
     with pytest.raises(InputError, match=r"wanted one by inclusion"):
         compared(Design(delay_margin_s=1.0), "other")

@@ -36,7 +36,7 @@ def flown(*, held: bool) -> Flight:
 
 
 def errors_of_delays_s(flight: Flight) -> FloatArray:
-    """Measured minus true loop delay, once links are known."""
+    """Measured minus true loop delay, once the links' delays are known."""
     assert flight.truth is not None
     off_s = flight.ticks["loop_delay_s"] + flight.ticks["repeated_s"] - true_loop_delays_s(flight.ticks, flight.truth)
     return off_s[(flight.ticks["time_s"] > SETTLED_S) & np.isfinite(off_s)]
@@ -49,7 +49,7 @@ def test_the_hold_counts_as_loop_delay() -> None:
     assert np.percentile(plain_s, 98) > 0.03
 
 
-def test_set_points_act_evenly() -> None:
+def test_held_set_points_act_at_even_intervals() -> None:
     """The true intervals between set-points that act, with and without holding them."""
     deviation_s: dict[bool, float] = {}
     for held in (True, False):
@@ -77,9 +77,10 @@ def test_a_prediction_assumes_the_hold() -> None:
 
 
 def test_holding_does_not_reduce_errors() -> None:
-    """Predicted over 0.5 s each way, jitter of 30 ms down: rms difference of the errors from those without jitter.
+    """Predicted over 0.5 s each way, with 30 ms of jitter down: rms difference of the errors from those without jitter.
 
-    At 15 m/s, 0.04 m without the hold and 0.14 m with it: the lag grows at first, and the assumed delay follows slowly.
+    At 15 m/s it is 0.04 m without the hold and 0.14 m with it: the lag grows at first, and the assumed delay follows
+    slowly.
     """
     base = load(SCENARIOS / "triangle5.toml")
     slow = tuple(vehicle.model_copy(update={"velocity_ne_m_s": (15.0, 0.0)}) for vehicle in base.vehicles)

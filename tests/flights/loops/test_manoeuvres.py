@@ -66,7 +66,7 @@ def test_the_patrol_keeps_its_shape_and_crosses_at_its_altitudes() -> None:
     # Decay of the first errors: 4.5 m exp(-0.4 * 18 s) leaves 3 mm; what the plan misses in a turn adds centimetres.
     assert error_m.max() < 0.1
     nearest_m = columns(flight.ticks, "nearest_m", 5)[settled]
-    # Both are where they should be to 0.1 m: sqrt(15² + 0.2²) = 15.001
+    # Both are within 0.1 m of their places: sqrt(15² + 0.2²) = 15.001
     assert nearest_m.min() == pytest.approx(15.0, abs=0.01)
     assert flight.events[-1].text == "completed: duration reached"
     down_m = columns(flight.ticks, "down_m", 5)
@@ -103,7 +103,7 @@ def test_a_formation_change_leads_vehicles_to_their_new_places() -> None:
     flight = fly_plan(plan_of(scenario))
     assert sizes(flight.ticks, "spacing_error_{}_m", 2)[:, 1].max() < 0.1
     north, east = (columns(flight.ticks, f"{axis}_m", 2)[-1] for axis in ("north", "east"))
-    # 20 m behind and 10 m to the left, at a heading of 60 degrees; both states are newest ones, of the same instant
+    # 20 m behind and 10 m to the left, at a heading of 60 degrees; both newest states are of the same instant
     assert north[1] - north[0] == pytest.approx(-20.0 * 0.5 + 10.0 * 0.866, abs=0.1)
     assert east[1] - east[0] == pytest.approx(-20.0 * 0.866 - 10.0 * 0.5, abs=0.1)
 

@@ -1,4 +1,4 @@
-"""The onboard loop flown over MAVLink in virtual time: gains uploaded, own terms at once, the station's late."""
+"""The onboard loop over MAVLink in virtual time: gains are uploaded, own terms act at once, the station's late."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -113,7 +113,7 @@ def test_vehicles_hold_their_gains_as_float32_before_they_are_armed(loss: float)
 def test_a_gain_not_taken_ends_the_start_with_nothing_armed() -> None:
     plan = flown(delayed(0.1))
     fleet, broken = Fleet(plan.scenario, START_NS), plan.gain.copy()
-    broken[2, 2] = 2e4  # beyond what it takes
+    broken[2, 2] = 2e4  # more than the vehicle accepts
     station = Station(replace(plan, gain=broken), start_ns=START_NS)
     assert list(fly_lockstep(station.plan, station=station, vehicles=fleet))
     assert station.end_reason.startswith("refused: vehicle 2 holds 0 in parameter FORM_KP_NN after 20000")
@@ -151,7 +151,7 @@ def test_without_set_points_vehicles_keep_their_places_by_own_sensors() -> None:
 
 
 def test_an_asymmetric_link_shows_an_error_that_is_not_there() -> None:
-    """The sensor on board keeps the place; the station takes the vehicle to be where it was half the asymmetry ago."""
+    """The sensor on board keeps the place; the station sees the vehicle where it was half the asymmetry ago."""
     scenario = onboard("chain3", duration_s=15.0)
     one_sided = VehicleLinks(system_id=3, up=Link(delay_s=0.16), down=Link(delay_s=0.02))
     links = scenario.links.model_copy(update={"vehicles": (one_sided,)})
@@ -230,7 +230,7 @@ def test_growth_either_side_of_the_margin_matches_the_sampled_model() -> None:
 
 
 def test_clocks_apart_leave_growth_and_loop_delays_as_they_are() -> None:
-    """The model takes the vehicles' steps as in step. By the difference of two flights with clocks at random."""
+    """The model assumes simultaneous steps of all vehicles. Two flights with random clocks are subtracted."""
     still = load(THESIS).clocks.model_copy(update={"drift_max_ppm": 0.0})
     plan = flown(delayed(1.0, clocks=still))
     calm = fly_calm(plan, None)
@@ -252,7 +252,7 @@ def test_the_search_says_no_delay_breaks_a_leader_follower_formation() -> None:
     assert caught.value.as_predicted  # growth rates within a part in ten thousand of those predicted
 
 
-def test_flights_that_contradict_a_margin_without_limit_are_told() -> None:
+def test_flights_that_contradict_a_margin_without_limit_are_reported() -> None:
     _, plan = flight_plan(onboard("chain3"))
 
     def half_as_fast(trials: Sequence[Trial]) -> list[Outcome]:
@@ -279,7 +279,7 @@ def test_ticks_of_the_opened_formation_keep_the_wider_spacing() -> None:
         rows.append(ticks)
     last = rows[-60]
     gap = np.hypot(last["north_m"][1] - last["north_m"][0], last["east_m"][1] - last["east_m"][0])
-    # positions are of two instants up to a period apart, 1.8 m of way
+    # positions are of two instants up to a period apart, 1.8 m of flight
     assert gap == pytest.approx(1.5 * np.hypot(*plan.formation.offset_ne_m[1]), abs=2.0)
 
 

@@ -1,4 +1,4 @@
-"""Formations flown by a control law or by dynamics of one's own."""
+"""Formations flown with a user's own control law or dynamics."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from scenarios.schema import Response
 from tests.support.fleets.own_code import LAW, coded, given
 
 ROUNDING_M = 1e-9
-"""Positions are single precision: of different numbers the nearest differ by 4e-6 m or more at these distances."""
+"""Positions are single precision: at these distances, different ones differ by 4e-6 m or more."""
 
 REMEMBERS = "memory['n'] = memory.get('n', 1) + 1; return command * memory['n'] / 2"
 

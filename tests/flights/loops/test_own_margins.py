@@ -18,7 +18,7 @@ from tests.support.known import known
 
 
 def chain(blocks: Mapping[tuple[int, int], tuple[float, ...]], **control: object) -> Scenario:
-    """Three vehicles, each behind another; u_i has the gains (of spacing and velocity, alike north and east) on e_j."""
+    """Three vehicles in a chain; `blocks[i, j]` are the gains of u_i on e_j: spacing and velocity, on both axes."""
     vehicles = [
         f"{{ system_id = {k}, position_ne_m = [{-61 * (k - 1)}, {9.7 * (k - 1)}], velocity_ne_m_s = [20, 0]"
         + (f", follows = {k - 1}, offset_ne_m = [-60, 9]" if k > 1 else "")
@@ -42,7 +42,7 @@ def chain(blocks: Mapping[tuple[int, int], tuple[float, ...]], **control: object
 
 
 def over(scenario: Scenario, each_way_s: float, **own_s: float) -> Scenario:
-    """The scenario over constant links of a delay, and of others for vehicles named `v2=` and so on."""
+    """The scenario over links of a constant delay; `v2=` and so on give vehicles a delay of their own."""
     own = tuple(
         VehicleLinks(system_id=int(name[1:]), up=Link(delay_s=at_s), down=Link(delay_s=at_s))
         for name, at_s in own_s.items()
@@ -59,11 +59,11 @@ QUICK_AND_SLOW = {
     (3, 2): (0.02, 0.02),
     (3, 3): (0.25, -0.8),
 }
-"""Vehicle 2 is quick and takes 290 ms; vehicle 3 is slow and takes more than a second."""
+"""Vehicle 2 is quick and tolerates 290 ms; vehicle 3 is slow and tolerates more than a second."""
 
 
 def test_a_quick_vehicle_keeps_its_margin_beside_a_slow_link() -> None:
-    """Flown, vehicle 2 alone breaks the loop at 289.65 ms of loop delay."""
+    """In flight, vehicle 2 alone breaks the loop at 289.65 ms of loop delay."""
     scenario = over(chain(QUICK_AND_SLOW), 0.03, v3=0.25)
     plan = over_own_links(*flight_plan(scenario))[1]
     _, quick, slow = check(plan).vehicles

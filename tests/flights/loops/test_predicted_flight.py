@@ -33,7 +33,7 @@ from tests.support.paths import SCENARIOS
 TRIANGLE = load(SCENARIOS / "triangle5.toml")
 GAINS = FixedGains(K1=-3.408, K2=0.631, K3=5.608)
 DECAY_1_S = 1.735
-"""Of these gains without delay, which prediction keeps at every delay: docs/explanation/prediction.md."""
+"""Decay rate of these gains without delay. Prediction keeps it at every delay: docs/explanation/prediction.md."""
 
 
 def scenario(prediction: float | str, *, link_s: float, **changes: object) -> Scenario:
@@ -88,7 +88,7 @@ def test_without_mismatch_errors_decay_as_without_delay() -> None:
 
 @cache
 def least_assumed() -> tuple[ScalarGains, float]:
-    """The least gains that decay as fast, and the longest delay of which their prediction tolerates 5 %."""
+    """The least gains that decay as fast, and the longest delay at which their prediction tolerates a 5 % mismatch."""
     k1, k3 = least_gains(DECAY_1_S, 0.02)
     gains = ScalarGains(k1, 0.2 * k1, k3, 0.0)
     return gains, longest_assumed_s(gains, 0.02, 0.05, 10.0)
@@ -103,7 +103,7 @@ def least_planned(*left_out: int) -> FlightPlan:
 
 
 def test_least_gains_decay_as_fast_at_their_longest_delay() -> None:
-    """2.16 s, 6.6 times what any static gains take at this decay. A mismatch of 0.1 ms would part the double root."""
+    """2.16 s, 6.6 times what any static gains take at this decay. A mismatch of 0.1 ms would split the double root."""
     study, assumed_s = Study(least_planned()), least_assumed()[1]
     beside = fly_trial(study.trial("probe", {"delay": assumed_s - 0.01}, seed=1, probe=2))
     link_s = 2.0 * assumed_s - 0.01 - known(beside.loop_delay_s)
@@ -115,7 +115,7 @@ def test_least_gains_decay_as_fast_at_their_longest_delay() -> None:
 @pytest.mark.slow(first=2)
 @pytest.mark.parametrize("mismatch", [-0.0475, 0.0475, 0.06])
 def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> None:
-    """A leader and its follower for 40 s: near the limit many modes are slow, and only time tells the slowest."""
+    """A leader and its follower for 40 s: near the limit many modes are slow, and only time separates them."""
     gains, assumed_s = least_assumed()
     plan, loop_s, waiting_s = least_planned(3, 4, 5), (1.0 + mismatch) * assumed_s, 0.01
     link = Link(delay_s=(loop_s - waiting_s) / 2.0)
@@ -129,7 +129,7 @@ def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> No
     timing = Timing(0.02, 0.02)
     computed = predicted_growth_rate(PAIR.A, PAIR.B, gains.K, timing, assumed_s=assumed_s, delay_s=loop_s)
     assert (growth_1_s < 0.0) == (computed < 0.0) == (abs(mismatch) < 0.05)
-    assert growth_1_s == pytest.approx(computed, abs=0.03)  # other modes still are as large
+    assert growth_1_s == pytest.approx(computed, abs=0.03)  # other modes are still as large
 
 
 def test_a_predicted_formation_settles_at_five_times_the_margin() -> None:
@@ -157,10 +157,10 @@ def test_the_measured_delay_is_followed() -> None:
 def test_drift_to_ten_margins_leaves_true_errors_below_1_percent(seed: int) -> None:
     """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost, at 91 m/s.
 
-    The assumed delay does not count: a vehicle and the one in front are predicted to the same instant, and v times its
-    error cancels. Errors of the clocks are errors of position in proportion to the speed, which the station cannot see.
-    Here the clocks are those of the first seconds. Each seed is one in which a line through the quickest single
-    exchanges gave errors of 0.85 % to 1.36 %.
+    An error of the assumed delay cancels, as a vehicle and the one in front are predicted to the same instant. Clock
+    errors do not: they are position errors in proportion to the speed, which the station cannot see. Here the clocks
+    are those of the first seconds. Each seed is one in which a line through the quickest single exchanges gave errors
+    of 0.85 % to 1.36 %.
     """
     drift = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=60.0, delay_s=1.5))
     jitter = Jitter(distribution="uniform", scale_s=0.03)

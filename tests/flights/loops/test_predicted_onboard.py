@@ -24,7 +24,7 @@ THESIS = load(SCENARIOS / "thesis_delay.toml")
 
 
 def triangle(prediction: float | str, *, link_s: float = 0.0, own: float = 0.2, others: float = 0.4) -> Scenario:
-    """The source's bidirectional three, with gains that weigh the others more: they tolerate 0.206 s."""
+    """The source's three bidirectional vehicles, with larger weights on the others: they tolerate 0.206 s."""
 
     def scaled(block: GainBlock) -> GainBlock:
         share = own if block.vehicle == block.of else others
