@@ -1,4 +1,4 @@
-"""`gcs bench`: what it says is measured, whatever the machine."""
+"""`gcs bench`: its figures are measured, whatever the machine."""
 
 import json
 import time  # noqa: TID251 - figures cannot exceed the time they were measured in

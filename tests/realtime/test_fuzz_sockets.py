@@ -52,7 +52,7 @@ def test_a_mirror_under_fire_counts_and_goes_on(other: socket.socket, commands: 
         assert any(name.startswith("passed on") for name in mirror.counters) == commands
 
 
-def test_links_before_other_vehicles_under_fire_count_and_go_on(other: socket.socket) -> None:
+def test_relayed_links_under_fire_count_and_go_on(other: socket.socket) -> None:
     scenario, rng, at = load(SCENARIOS / "chain3.toml"), np.random.default_rng(5), ("127.0.0.1", free_port())
     links, peers = Relay(scenario, 0), Peers([at], other.getsockname())
     passed = 0

@@ -1,7 +1,7 @@
 """A flight that is disturbed at a random instant: nothing is left of it but files, and the next one is right.
 
 `SLOW_TESTS=1 MAYHEM=20 python3 make.py test tests/realtime/test_mayhem.py` does each kind of harm twenty times;
-MAYHEM_SEED draws others.
+MAYHEM_SEED draws other instants.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ KINDS = ("kill", "stop for 3 s", "disk full", "term", "hang up", "terminal close
 
 
 class Run:
-    """One `gcs fly` in a session of its own, on a terminal of its own if it is wanted."""
+    """One `gcs fly` in a session of its own, on a terminal of its own if wanted."""
 
     def __init__(self, scenario: Path, port: int, folder: Path, *, on_terminal: bool) -> None:
         self.folder = folder
@@ -63,7 +63,7 @@ class Run:
 
     def flies(self) -> bool:
         """Whether the formation flies, or the run has ended before that."""
-        if self.terminal >= 0:  # somebody looks at the table
+        if self.terminal >= 0:  # somebody has to read the table
             os.set_blocking(self.terminal, False)
             with contextlib.suppress(OSError):
                 os.read(self.terminal, 1 << 16)
@@ -73,7 +73,7 @@ class Run:
         return RunTail(self.folder).events()
 
     def processes(self) -> dict[int, str]:
-        """All that still run with this folder in their command line."""
+        """The processes that still run with this folder in their command line."""
         found: dict[int, str] = {}
         for entry in Path("/proc").iterdir():
             with contextlib.suppress(OSError):
@@ -113,7 +113,7 @@ CODES = {
     "disk full": {0, 1, 2},
     "terminal closed": {130, 0},
 }
-"""0 if it came when all was done."""
+"""Exit codes after each kind of harm; 0 if it came when all was done."""
 
 
 def is_recovered(folder: Path) -> bool:

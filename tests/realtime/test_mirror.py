@@ -38,7 +38,7 @@ PROBE = 31000
 
 
 class Listener:
-    """Another ground station, plain pymavlink: hears everything, and sends a heartbeat and a command a second."""
+    """Another ground station, plain pymavlink: hears everything, and now and then sends a heartbeat and a command."""
 
     def __init__(self, system_id: int) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -160,7 +160,7 @@ def test_mavsdk_on_a_mirror_finds_every_vehicle_and_its_position(tmp_path: Path)
     assert sorted(found) == [1, 2, 3]
     for system_id, told in found.items():
         assert told.position.north_m == pytest.approx(ends_m[system_id], abs=30.0)  # a third of a second at 91 m/s
-        assert told.velocity.north_m_s == pytest.approx(91.4, abs=3.0)  # some still close up
+        assert told.velocity.north_m_s == pytest.approx(91.4, abs=3.0)  # some are still closing up
     assert summary["mirror"]["refused HEARTBEAT"] >= 1
 
 

@@ -53,7 +53,7 @@ def packed(mav: Any, message: dialect.MAVLink_message) -> bytes:
 
 
 def holds_key(folder: Path, secret: bytes) -> list[str]:
-    """Files of a folder in which a key is, as bytes or as text."""
+    """Files of a folder that contain a key, as bytes or as text."""
     forms = (secret, secret.hex().encode(), repr(secret).encode())
     files = [file for file in folder.rglob("*") if file.is_file()]
     return [file.name for file in files if any(form in file.read_bytes() for form in forms)]
@@ -204,7 +204,7 @@ def test_only_a_pymavlink_station_with_the_key_commands_our_vehicles(tmp_path: P
 
 
 def test_our_station_flies_a_pymavlink_vehicle_only_with_the_key() -> None:
-    """Up to what the station asks of it: the vehicle's clock, its telemetry rate, its mode."""
+    """Only until the station has sent its requests: for the vehicle's clock, its telemetry rate, its mode."""
     scenario = load(SCENARIOS / "chain3.toml")
     gains = scenario.control.model_copy(update={"gains": FixedGains(K1=-3.4, K2=0.6, K3=5.6)})
     _, plan = flight_plan(scenario.model_copy(update={"control": gains}))

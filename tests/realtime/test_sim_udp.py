@@ -1,4 +1,4 @@
-"""The real-time driver on real sockets."""
+"""The vehicles' real-time driver on real sockets."""
 
 import select
 import socket

@@ -1,4 +1,4 @@
-"""The station's socket: when datagrams came is the kernel's word, on the station's clock."""
+"""The station's socket: the kernel stamps when datagrams arrive, and the stamps are on the station's clock."""
 
 import socket
 
@@ -17,9 +17,9 @@ def spin(wait_ns: int) -> None:
         pass
 
 
-def test_a_datagram_arrives_between_sending_and_reading_and_waits() -> None:
+def test_a_datagrams_stamp_lies_between_sending_and_reading() -> None:
     with StationSocket("127.0.0.1", 0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
-        # Linux begins to stamp some time after the first socket has asked for it; until then reading stamps.
+        # Linux begins to stamp some time after the first socket has asked for it; until then reading does.
         for _ in range(1000):
             peer.sendto(b"", link.address)
             spin(2_000_000)

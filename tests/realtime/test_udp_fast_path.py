@@ -1,4 +1,4 @@
-"""In real time, kernels do nearly all steps of the station of plain vehicles, and record what steps in Python would."""
+"""With plain vehicles, kernels do nearly all steps of a station in real time, and record what Python steps would."""
 
 from collections import Counter
 from pathlib import Path

@@ -36,7 +36,7 @@ def vehicles_log(folder: Path) -> str:
 
 
 def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Loop delay of each set-point that acted, from the vehicles' own log: when it acted minus when the state was."""
+    """Loop delay of each set-point that acted, from the vehicles' log: from its state's sampling until it acted."""
     truth = read_truth(folder / TRUTH_FILE)
     sampled = {(int(r["system_id"]), int(r["key"])): int(r["time_ns"]) for r in truth[truth["kind"] == SAMPLED]}
     acted = {(int(r["system_id"]), int(r["key"])): int(r["time_ns"]) for r in truth[truth["kind"] == ACTED]}
@@ -82,7 +82,7 @@ def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, d
 
 
 def check_tlog(file: Path) -> list[tuple[int, Any]]:
-    """Every entry is a time and one frame that pymavlink accepts; times run forwards but for what a tick collects."""
+    """Every entry is a time and one frame that pymavlink accepts; times increase, except within a tick."""
     parser: Any = dialect.MAVLink(None)
     data = file.read_bytes()
     at, frames = 0, list[tuple[int, Any]]()
@@ -99,7 +99,7 @@ def check_tlog(file: Path) -> list[tuple[int, Any]]:
     return frames
 
 
-def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
+def test_too_slow_a_link_is_unstable_with_exit_code_1(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     scenario = short(tmp_path, "triangle5", 20.0)
     done = gcs("fly", scenario, "--listen", "127.0.0.1:0", "--link-delay", "0.4", "--out", folder)
@@ -281,7 +281,7 @@ def test_gains_are_chosen_for_links_measured_just_before_the_flight(tmp_path: Pa
     summary, design = json.loads(done.stdout), json.loads((folder / "design.json").read_text())
     measured = design["for_link"]
     assert (measured["source"], measured["vehicles"]) == ("the 5 s before the flight", [1, 2, 3])
-    # within a control period: where telemetry falls between two ticks is drawn, and in a flight it stays
+    # within a control period: the phase of telemetry between two ticks is random, and constant during a flight
     assert measured["loop_delay_s_p50"] == pytest.approx(summary["loop_delay_s"]["p50"], abs=0.02)
     assert measured["loop_delay_s_worst"] - measured["loop_delay_s_least"] > 0.04
     own = next(own for own in measured["candidates"] if own["K1"] == pytest.approx(design["K1_1_s"][0][0]))

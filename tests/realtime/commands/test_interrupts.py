@@ -24,7 +24,7 @@ FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
     [
         (STRESS, "typer", 1, signal.SIGINT),
         (STRESS, "numpy", 1, signal.SIGINT),
-        (STRESS, "site", 3, signal.SIGINT),  # a worker starts: this process and the tracker of resources have
+        (STRESS, "site", 3, signal.SIGINT),  # a worker starts, after the command and the resource tracker
         (STRESS, "numpy", 2, signal.SIGINT),
         (FLY, "numpy", 1, signal.SIGINT),
         (FLY, "site", 2, signal.SIGINT),  # the observer starts
@@ -34,7 +34,7 @@ FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
         (FLY, "site", 2, signal.SIGHUP),
     ],
 )
-def test_a_signal_while_workers_import_is_no_traceback(
+def test_a_signal_while_workers_import_shows_no_traceback(
     arguments: list[str], module: str, times: int, number: signal.Signals, tmp_path: Path
 ) -> None:
     told = ended([*arguments, str(tmp_path / "out")], module, times, lambda process: os.killpg(process.pid, number))
@@ -49,7 +49,7 @@ def test_a_front_that_is_interrupted_leaks_no_semaphores() -> None:
 
 
 def ended(arguments: list[str], module: str, times: int, end: Callable[["subprocess.Popen[str]"], None]) -> str:
-    """What a command says that is ended, with code 130, when a module has been imported so many times."""
+    """The last stderr of a command that `end` stops, with code 130, once a module has been imported `times` times."""
     command = [sys.executable, "-m", "gcs", *arguments]
     environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}  # each process tells what it has imported
     with subprocess.Popen(

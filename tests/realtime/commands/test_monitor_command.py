@@ -109,7 +109,7 @@ def test_a_vehicle_is_sent_only_timesync_requests_or_nothing(option: str) -> Non
     assert {frame.msg_id for frame in frames} == (set() if option == "--silent" else {mavlink.TIMESYNC})
 
 
-def test_nobody_heard_is_a_failure_and_is_said() -> None:
+def test_nobody_heard_is_a_reported_failure() -> None:
     process = monitor("--listen", free_address(), "--for", "0.3")
     out, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1

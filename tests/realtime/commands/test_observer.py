@@ -88,7 +88,7 @@ def test_growing_runs_are_followed_to_their_end_despite_ctrl_c(tmp_path: Path) -
         assert process.returncode == 0
     assert not ready.exists()
     assert recorded(tmp_path) == 650
-    # Without a terminal each event is said once, and the formation's state now and then.
+    # Without a terminal each event is printed once, and the formation's state now and then.
     lines = output.splitlines()
     assert [text.split("s  ", 1)[1] for text in lines if "spacing error" not in text] == [
         "phase  connecting",

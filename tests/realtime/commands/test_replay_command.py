@@ -50,8 +50,8 @@ def test_a_runs_log_gives_its_summary_to_tenths_of_milliseconds(tmp_path: Path) 
     for name in ("ticks", "deadline_misses"):
         assert abs(rebuilt["control"][name] - recorded["control"][name]) <= 1
     for was, found in zip(recorded["vehicles"], rebuilt["vehicles"], strict=True):
-        # Requests are stamped in the log when they have been sent, some 0.05 ms after the time that they bear; a
-        # single one may be held up by the machine.
+        # The log stamps requests when they have been sent, some 0.05 ms after the time that they bear; the machine
+        # may hold up a single one.
         for name in ("rtt_s", "loop_delay_s"):
             assert quantiles_ms(found[name], "p50") == pytest.approx(quantiles_ms(was[name], "p50"), abs=0.3)
             assert quantiles_ms(found[name], "p99") == pytest.approx(quantiles_ms(was[name], "p99"), abs=2.0)

@@ -1,4 +1,4 @@
-"""The command, run as a user or a station runs it, with a small pymavlink client as the station."""
+"""`sim-vehicles`, run as a user or a station runs it, with a small pymavlink client as the station."""
 
 import signal
 import socket
@@ -188,7 +188,7 @@ def test_wrong_input_is_answered_in_one_line(
     monkeypatch.chdir(tmp_path)
     try:
         code = run(arguments)
-    except SystemExit as end:  # argparse's way
+    except SystemExit as end:  # how argparse refuses
         code = end.code
     assert code == 2
     errors = capsys.readouterr().err
@@ -197,7 +197,7 @@ def test_wrong_input_is_answered_in_one_line(
     assert named in errors
 
 
-def test_a_scenario_that_ships_is_flown_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_shipped_scenario_is_flown_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     from sim_vehicles.drive.cli import run
 
     assert run(["chain3", "--duration", "0.1"]) == 0

@@ -1,4 +1,4 @@
-"""The live tables as a person sees them, in real terminals: rows, headroom, modes, and afterwards a working shell."""
+"""The live tables as a person sees them, in real terminals: rows, headroom, modes, and a working shell afterwards."""
 
 import re
 import shutil
