@@ -25,7 +25,7 @@ COUNT = 4
 
 
 def requests(now_ns: int) -> list[Datagram]:
-    """What a station sends to every vehicle at the beginning."""
+    """What a station first sends to every vehicle."""
     return [
         (k, _unnumbered(frame), now_ns)
         for k in range(1, COUNT + 1)
@@ -34,7 +34,7 @@ def requests(now_ns: int) -> list[Datagram]:
 
 
 def flight(fleet: Fleet, pace_ns: int = 20 * MS) -> list[Datagram]:
-    """Two seconds with set-points at 50 Hz, the fleet stepped at a pace of its own: all that it sent."""
+    """All that a fleet sends in two seconds with set-points at 50 Hz, stepped every `pace_ns`."""
     out = [*fleet.step(requests(START), START)]
     setpoints_ns = START
     for now_ns in range(START + pace_ns, START + 2 * SECOND + 1, pace_ns):
@@ -63,8 +63,8 @@ def test_the_same_scenario_gives_the_same_bytes_and_instants() -> None:
     assert first != other
 
 
-def test_it_does_not_matter_how_often_it_is_stepped() -> None:
-    """Everything has its exact instant; only a coarser pace delivers what is sent meanwhile later."""
+def test_how_often_the_fleet_is_stepped_changes_nothing() -> None:
+    """Every event has its exact instant; a coarser pace only delivers datagrams later."""
     fine, coarse = (
         sorted(flight(Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START), pace), key=lambda d: (d[2], d[0]))
         for pace in (5 * MS, 20 * MS)
@@ -74,7 +74,7 @@ def test_it_does_not_matter_how_often_it_is_stepped() -> None:
 
 @pytest.mark.parametrize("reordering", [False, True])
 def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
-    """Of vehicles that are not plain every event goes through the shell; what happened is recorded in either way."""
+    """Vehicles that are not plain send every event through the shell; both ways leave the same record."""
     link = Link(
         delay_s=0.03,
         jitter=Jitter(distribution="normal", scale_s=0.02),
@@ -99,7 +99,7 @@ def test_the_kernel_does_what_the_shell_does(reordering: bool) -> None:
 
 
 @pytest.mark.parametrize("rows", [6, 7, 50])
-def test_nothing_is_lost_when_no_more_records_have_room(rows: int) -> None:
+def test_a_full_record_buffer_loses_nothing(rows: int) -> None:
     link = Link(delay_s=0.03, loss_probability=0.1, duplicate_probability=0.2, corrupt_probability=0.05)
     own = scenario(COUNT).model_copy(update={"links": Links(up=link, down=link)})
     roomy, narrow = MemoryRecorder(), MemoryRecorder(rows)

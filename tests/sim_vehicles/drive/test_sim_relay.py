@@ -132,7 +132,7 @@ def a_socket() -> socket.socket:
 def running(
     flown: schema.Scenario, station: socket.socket, folder: Path
 ) -> Generator[tuple[int, subprocess.Popen[str]]]:
-    """The command in front of one vehicle port; it does not outlive the test."""
+    """`sim-vehicles --links-only` in front of one vehicle port; it does not outlive the test."""
     (folder / "links.toml").write_text(dump(flown))
     port = free_port()
     station_at = f"127.0.0.1:{station.getsockname()[1]}"
@@ -167,7 +167,7 @@ def test_relayed_vehicles_and_station_communicate_and_truth_is_logged(tmp_path: 
         station, one, two, stranger = (opened.enter_context(a_socket()) for _ in range(4))
         port, process = opened.enter_context(running(scenario(2, up_s=0.03, down_s=0.01), station, tmp_path))
         relay = ("127.0.0.1", port)
-        stranger.sendto(b"\0" * 40, relay)  # says of no frame who it is
+        stranger.sendto(b"\0" * 40, relay)  # no frame, so of no vehicle
         stranger.sendto(frame(255), relay)  # a station is no vehicle
         addresses: dict[int, tuple[str, int]] = {}
         for system_id, own in ((1, one), (2, two)):
@@ -175,7 +175,7 @@ def test_relayed_vehicles_and_station_communicate_and_truth_is_logged(tmp_path: 
             data, addresses[system_id] = station.recvfrom(2048)
             assert data == frame(system_id)
         assert addresses[1] != addresses[2]
-        one.sendto(garbage := b"\xff" * 200, relay)  # of a known peer: the station has to bear it
+        one.sendto(garbage := b"\xff" * 200, relay)  # from a known peer: passed on, and left to the station
         assert station.recvfrom(2048) == (garbage, addresses[1])
         for system_id, own in ((2, two), (1, one)):
             station.sendto(wanted := setpoint(float(system_id)), addresses[system_id])
@@ -183,7 +183,7 @@ def test_relayed_vehicles_and_station_communicate_and_truth_is_logged(tmp_path: 
         with a_socket() as again:  # the vehicle was started anew, at another port
             station.settimeout(0.5)
             again.sendto(frame(2, 7), relay)
-            while (got := received(station)) is None:  # for 1.5 s it may be another that claims this vehicle's id
+            while (got := received(station)) is None:  # for 1.5 s it may be another sender that claims this id
                 again.sendto(frame(2, 7), relay)
             assert got == (frame(2, 7), addresses[2])
             station.sendto(wanted := heartbeat(), addresses[2])

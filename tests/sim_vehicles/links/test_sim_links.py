@@ -152,7 +152,7 @@ arrivals = st.lists(st.integers(0, 50 * MS), max_size=60).map(sorted)
 def passed(
     behaviour: link_keys.Link, entered: list[int], seed: int, recorder: MemoryRecorder | None = None
 ) -> tuple[Link, list[Entry]]:
-    """The link and what came out of it, the last second included, when numbered datagrams entered at these times."""
+    """The link, and all that came out of it when numbered datagrams entered at these times."""
     link = Link(behaviour, capacity=20, seed=seed, queues=new_queues(1, recorder))
     link.zero_ns = 0
     out: list[Entry] = []
@@ -196,7 +196,7 @@ def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
     assert numbers == sorted(numbers)
 
 
-def test_with_reordering_some_do() -> None:
+def test_with_reordering_some_datagrams_overtake_earlier_ones() -> None:
     jitter = Jitter(distribution="uniform", scale_s=0.03)
     link = link_keys.Link(delay_s=0.03, jitter=jitter, reordering=True)
     _, out = passed(link, [k * MS for k in range(20)], 1)

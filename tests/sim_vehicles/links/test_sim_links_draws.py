@@ -1,8 +1,8 @@
 """What links draw: the distributions, against theory, and that seeds alone decide.
 
 Statistical tolerances: a test with a fixed seed passes always or never, so they only have to be wide enough for an
-honest seed and narrow enough for a mistake. Kolmogorov-Smirnov at p = 0.001 lets 999 of 1000 honest seeds pass; means
-are compared within four standard errors (1 honest seed in 16,000 is farther off).
+honest seed and narrow enough to show a mistake. Kolmogorov-Smirnov at p = 0.001 lets 999 of 1000 honest seeds pass;
+means are compared within four standard errors (1 honest seed in 16,000 is farther off).
 """
 
 import math
@@ -25,7 +25,7 @@ from tests.support.sim_client import scenario
 MS = 1_000_000
 COUNT = 20_000
 SAMPLES = 2000
-"""For Kolmogorov-Smirnov: an error of 4 % in the distribution function is found."""
+"""For Kolmogorov-Smirnov: enough to detect an error of 4 % in the distribution function."""
 
 
 def delays_s(link: link_keys.Link, *, count: int, seed: int = 3) -> list[float]:
@@ -98,14 +98,14 @@ def test_bursts_follow_the_gilbert_elliott_model() -> None:
     lost = np.zeros(COUNT, bool)
     lost[recorder.records["time_ns"]] = True
     bad = p / (p + r)
-    # Neighbours agree: the variance of the mean is (1 + c) / (1 - c) times that of independent losses, c = 1 - p - r.
+    # Neighbours are correlated, c = 1 - p - r: the mean's variance is (1 + c) / (1 - c) times that of independence.
     error = math.sqrt(bad * (1 - bad) / COUNT * (2 - p - r) / (p + r))
     assert lost.mean() == pytest.approx(bad, abs=4 * error)
     edges = np.flatnonzero(np.diff(np.concatenate(([False], lost, [False])).astype(int)))
     lengths = edges[1::2] - edges[::2]
     # A bad time's length is geometric: mean 1 / r, standard deviation sqrt(1 - r) / r.
     assert lengths.mean() == pytest.approx(1 / r, abs=4 * math.sqrt(1 - r) / r / math.sqrt(lengths.size))
-    assert lengths.max() > 10  # independent loss of 9 % would make one of 11 in 10^11
+    assert lengths.max() > 10  # independent loss of 9 % has a burst of 11 once in 10^11
 
 
 def test_good_and_bad_state_lose_at_their_rates() -> None:
@@ -183,7 +183,7 @@ def test_an_added_effect_leaves_the_other_draws(change: dict[str, float]) -> Non
     assert all(before[number] == after[number] for number in common)
 
 
-def test_jitter_alone_draws_only_that_and_as_with_loss() -> None:
+def test_without_loss_only_jitter_is_drawn_and_stays_the_same() -> None:
     with_loss = link_keys.Link(jitter=Jitter(distribution="gamma", scale_s=0.01, shape=2.5), loss_probability=0.1)
     drawn: list[Any] = []
     for link in (with_loss, with_loss.model_copy(update={"loss_probability": 0.0})):

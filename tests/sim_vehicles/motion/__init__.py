@@ -1,1 +1,1 @@
-"""Tests of how simulated vehicles move."""
+"""How simulated vehicles move."""

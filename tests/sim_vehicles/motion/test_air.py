@@ -1,4 +1,4 @@
-"""What pushes the vehicles, and what they believe of themselves: distributions, known answers, and the truth log."""
+"""What pushes the vehicles, and the errors of their own navigation: distributions, known answers, and the truth log."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ UNLIMITED = bounds_of(Limits())
 
 
 def disturbances(recorder: MemoryRecorder, kind: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times (ns) and components, north and east, of the disturbances of one kind of vehicle 1."""
+    """Times (ns) and components (north, east) of vehicle 1's disturbances of one kind."""
     own = recorder.records[(recorder.records["kind"] == kind) & (recorder.records["system_id"] == 1)]
     return own["time_ns"], np.stack([own["entered_ns"], own["due_ns"]], axis=1) * 1e-9
 

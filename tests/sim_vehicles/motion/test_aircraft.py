@@ -1,4 +1,4 @@
-"""The aircraft of jsbsim: what its autopilot holds and follows, and how it fits between two instants."""
+"""The jsbsim aircraft: what its autopilot holds and follows, and its motion between two instants."""
 
 import math
 
@@ -37,7 +37,7 @@ def flown(command: Command, duration_s: float, *, piece_s: float = 0.02) -> tupl
     return aircraft, state
 
 
-def test_holds_speed_course_and_altitude() -> None:
+def test_the_aircraft_holds_speed_course_and_altitude() -> None:
     aircraft, state = flown(COAST, 60.0)
     assert abs(state.speed_m_s - SPEED_M_S) < 0.01
     assert abs(state.yaw_rad) < 1e-4
@@ -60,7 +60,7 @@ def test_throttle_accelerates_along_the_course() -> None:
     assert abs(state.speed_m_s - SPEED_M_S - 0.5 * (10.0 - 0.8)) < 0.1
 
 
-def test_aircraft_forget_what_they_foresee_and_steps_do_not_matter() -> None:
+def test_neither_foreseeing_nor_step_length_changes_the_motion() -> None:
     _, whole = flown(Command(0.3, 0.3), 4.2, piece_s=0.06)
     one = scenario()
     aircraft, state = Aircraft(one, one.vehicles[0]), State(0.0, 0.0, 0.0, SPEED_M_S)
@@ -70,14 +70,14 @@ def test_aircraft_forget_what_they_foresee_and_steps_do_not_matter() -> None:
     assert state == pytest.approx(whole, rel=1e-9)
 
 
-def test_is_foreseen_by_its_acceleration() -> None:
+def test_the_aircrafts_motion_is_foreseen_from_its_acceleration() -> None:
     aircraft, state = flown(Command(0.0, 1.0), 2.0)
     foreseen = aircraft.foreseen(state, Command(0.0, 1.0), BOUNDS, 0.02)
     # a jerk of at most 1 m/s³: 0.02³ / 6
     assert aircraft.advance(state, Command(0.0, 1.0), BOUNDS, 0.02)[:2] == pytest.approx(foreseen[:2], abs=1e-5)
 
 
-def test_a_push_carries_it_along() -> None:
+def test_a_push_carries_the_aircraft_along() -> None:
     one = scenario()
     aircraft, state = Aircraft(one, one.vehicles[0]), State(0.0, 0.0, 0.0, SPEED_M_S)
     state = aircraft.advance(state, COAST, BOUNDS, 0.02)

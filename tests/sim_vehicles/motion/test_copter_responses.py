@@ -19,7 +19,7 @@ STEP_S = 0.02
 
 
 def flown(settings: Autopilot, amplitude_m_s2: float, omega: float) -> complex:
-    """Gain and phase of the acceleration, from a sine sent every 20 ms with its velocity."""
+    """Complex gain of the acceleration for a sine that is sent every 20 ms together with its velocity."""
     motion, sums, count = Motion(0j, inner=inner_of(settings)), 0j, round(20 * math.tau / omega / STEP_S)
     velocity = 0j
     for k in range(2 * count):

@@ -1,4 +1,4 @@
-"""A vehicle obeys one ground station; others are refused, counted, told of, and may still ask."""
+"""A vehicle obeys one ground station; others are refused, counted and reported, but may still ask."""
 
 from collections.abc import Callable
 from typing import Any
@@ -97,7 +97,7 @@ def test_a_display_that_comes_first_admits_the_station(make: Callable[[], Shell[
     vehicle.step([(frame, START + SECOND) for frame in shown], START + SECOND)
     sent = vehicle.step([(guided(), START + 2 * SECOND)], START + 2 * SECOND)
     assert "COMMAND_ACK" in {parse(data).get_type() for data, _ in sent}
-    # and once there is a station, questions are still answered while rates are its own
+    # once there is a station, others are still answered, but only the station sets rates
     refused = vehicle.counters["refused_not_the_station"]
     assert refused == 0
     for frame, more in ((command_from_another(512, 148), 0), (COMMANDS["interval"], 1)):
@@ -128,7 +128,7 @@ def test_after_the_station_has_been_silent_another_takes_over() -> None:
     sent = vehicle.step([(COMMANDS["mode"], START + 5_100_000_000)], START + 5_100_000_000)
     assert [parse(data).result for data, _ in sent if parse(data).get_type() == "COMMAND_ACK"] == [0]
     vehicle.step([(arm(), START + 6 * SECOND)], START + 6 * SECOND)
-    assert vehicle.counters["refused_not_the_station"] == 2  # now the first is the other one
+    assert vehicle.counters["refused_not_the_station"] == 2  # the first station is now the other one
 
 
 class TwoStations:

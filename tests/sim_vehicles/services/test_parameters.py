@@ -120,7 +120,7 @@ def test_a_system_id_is_not_changed_in_flight() -> None:
     assert answer.param_value == 1.0
 
 
-def test_another_vehicle_s_parameters_are_not_answered() -> None:
+def test_requests_for_another_vehicles_parameters_are_not_answered() -> None:
     vehicle = a_vehicle()
     assert told(vehicle, ask_list(system=2)) == []
     assert vehicle.counters["ignored_not_addressed"] == 1
@@ -148,7 +148,7 @@ def test_a_shorter_time_out_does_not_end_in_the_past() -> None:
     ]
 
 
-def test_setting_what_it_is_already_keeps_no_silent_station_alive() -> None:
+def test_setting_an_unchanged_value_keeps_no_silent_station_alive() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     frames = [(put("GUID_TIMEOUT", 1.0), START + k * SECOND // 10) for k in range(30)]

@@ -105,7 +105,7 @@ def test_a_version_request_starts_the_health_reports(kind: str, greeting: bytes)
     assert named(sent, "EXTENDED_SYS_STATE")[-1].landed_state == dialect.MAV_LANDED_STATE_ON_GROUND
 
 
-def test_a_greeting_slows_nothing_down() -> None:
+def test_a_version_request_slows_no_telemetry() -> None:
     vehicle = VEHICLES["double_integrator"]()
     vehicle.step([(command(511, 32, 20_000), START)], START)
     assert len(named(sent_after(vehicle, command(512, 148), 1.0, 2.0), "LOCAL_POSITION_NED")) >= 49
@@ -244,7 +244,7 @@ def test_every_start_up_step_of_qgroundcontrol_is_answered(kind: str) -> None:
     assert [m.param_id for m in named(received, "PARAM_ERROR")] == ["_HASH_CHECK"]
     assert len(named(received, "FILE_TRANSFER_PROTOCOL")) == 1
     assert not named(received, "STATUSTEXT")  # nothing for it to show
-    # it starts its streams again when these were not heard for 10 s
+    # QGroundControl starts its streams again if it has not heard these for 10 s
     for name in ("HOME_POSITION", "BATTERY_STATUS"):
         assert len(named(received, name)) >= 10
     set_up = ("SYS_AUTOSTART", "CAL_ACC0_ID") if kind == "px4" else ("FRAME_CLASS", "INS_ACCOFFS_X", "BATT_CAPACITY")
@@ -252,7 +252,7 @@ def test_every_start_up_step_of_qgroundcontrol_is_answered(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_a_mode_set_the_old_way_is_flown(kind: str) -> None:
+def test_a_mode_requested_by_set_mode_is_flown(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     number = 5 if kind != "px4" else 4 << 16 | 5 << 24
     request = pack(dialect.MAVLink_set_mode_message(1, dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, number))
@@ -283,7 +283,7 @@ def velocity_setpoint(
     *,
     other: float = 0.0,
 ) -> bytes:
-    """With `other` in all fields of position and acceleration."""
+    """A velocity set-point, with `other` in all fields of position and acceleration."""
     x = other
     message = dialect.MAVLink_set_position_target_local_ned_message
     return pack(message(0, 1, 1, frame, mask, x, x, x, *velocity, x, x, x, yaw, yaw_rate))

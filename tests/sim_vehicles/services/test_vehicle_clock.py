@@ -56,7 +56,7 @@ def test_positions_are_sampled_exactly_on_the_millisecond_they_name() -> None:
     vehicle.step([(command(511, 32, 20_000), START)], START)
     sent: list[tuple[bytes, int]] = []
     now = START
-    for step in (3_141_592, 27_000_001, 111, 19_999_999, 450_000_000):  # late and odd, as a real loop is
+    for step in (3_141_592, 27_000_001, 111, 19_999_999, 450_000_000):  # late and irregular, as a real loop is
         now += step
         sent += vehicle.step([], now)
     positions = parse_all(sent, "LOCAL_POSITION_NED")

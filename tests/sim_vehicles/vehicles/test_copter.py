@@ -166,7 +166,7 @@ def test_a_set_point_ends_a_guided_take_off() -> None:
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_one_that_does_not_take_off_disarms_after_ten_seconds(flavour: Flavour) -> None:
+def test_a_copter_left_on_the_ground_disarms_after_ten_seconds(flavour: Flavour) -> None:
     vehicle = copter(flavour)
     assert result(vehicle, arm(), 5.0) == 0
     vehicle.step([], START + 14 * SECOND)
@@ -215,7 +215,7 @@ def test_a_copter_responds_with_the_scenarios_lag(flavour: Flavour) -> None:
     vehicle, at_s = airborne(flavour, lag_s=0.3, velocity_gain_1_s=1.5)
     start_m = vehicle.craft.motion.place_m.real
     tell(vehicle, setpoint(0.7, 0.0, velocity=(1.2, 0.0), mask=VELOCITY_ACCELERATION), at_s)
-    tell(vehicle, command(0), at_s + 0.9)  # whatever it is told, it is brought up to date
+    tell(vehicle, command(0), at_s + 0.9)  # any message brings its state up to date
     expected = integrated(flavour, vehicle.craft.settings, (1.2, 0.7), 0.9)
     motion = vehicle.craft.motion
     found = motion.place_m.real - start_m, motion.velocity_m_s.real, motion.acceleration_m_s2.real

@@ -20,7 +20,7 @@ def stamped(key_ms: int) -> Setpoint:
 
 
 def played(delays_ms: list[float]) -> tuple[Hold, list[tuple[int, float]], list[int]]:
-    """Set-points 20 ms apart with these delays: keys with the time each was late to act (ms), and the late ones."""
+    """Play set-points 20 ms apart with these delays: the hold, (key, ms from stamp to action), and the late keys."""
     hold, acted, late = Hold(), list[tuple[int, float]](), list[int]()
 
     def let_act(until_ns: int) -> None:
@@ -62,7 +62,7 @@ def test_every_set_point_acts_once_and_never_before_it_arrives(delays_ms: list[f
 
 
 def test_stamps_of_another_station_begin_anew() -> None:
-    """The next station has run for longer: by the lag of the one before, its set-points would be held for 100 s."""
+    """The next station's stamps are 100 s ahead: by the previous lag, its set-points would be held that long."""
     hold = Hold()
     hold.take(stamped(1000), START + SECOND, CLOCK)
     hold.take(stamped(101_020), START + SECOND + 20 * MS, CLOCK)

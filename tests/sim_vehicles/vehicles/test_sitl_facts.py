@@ -24,7 +24,7 @@ def timesync(ts1: int) -> bytes:
 
 
 def target_at(vehicle: Shell[Copter], at_s: float) -> Any:
-    """The target that it answers a request with, within the millisecond after."""
+    """The target that a vehicle reports within a millisecond of a request."""
     time_ns = START + round(at_s * SECOND)
     vehicle.step([], time_ns - 1)
     sent = vehicle.step([(command(512, TARGET), time_ns)], time_ns + MS)
@@ -40,7 +40,7 @@ def backdated_ns(vehicle: Shell[Copter], count: int) -> np.ndarray[tuple[int], n
     return np.array(found)
 
 
-def test_replies_are_dated_back_by_up_to_the_configured_time() -> None:
+def test_replies_are_backdated_by_up_to_the_configured_time() -> None:
     back_ns = backdated_ns(copter(sitl=Sitl(timesync_back_s=0.0035)), 400)
     assert back_ns.min() >= 0
     assert back_ns.max() < 3.5 * MS

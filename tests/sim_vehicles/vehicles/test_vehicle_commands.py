@@ -25,12 +25,12 @@ from tests.support.sim_client import (
 
 
 def answers(vehicle: Shell[DoubleIntegrator], request: bytes, time_ns: int = START) -> list[Any]:
-    """What is sent at the instant of a request, because of it."""
+    """What a vehicle sends at the instant of a request."""
     return [m for m, t in parse_all(vehicle.step([(request, time_ns)], time_ns)) if t == time_ns]
 
 
 def result(vehicle: Shell[DoubleIntegrator], request: bytes, time_ns: int = START) -> int:
-    """The result of a command, acknowledged to who asked."""
+    """The result of a command, acknowledged to its sender."""
     (ack,) = [m for m in answers(vehicle, request, time_ns) if m.get_type() == "COMMAND_ACK"]
     assert (ack.target_system, ack.target_component) == (255, 190)
     assert ack.command == dialect.MAVLink(None).parse_buffer(request)[0].command  # type: ignore[index]

@@ -45,7 +45,7 @@ UNDISTURBED = future(in_flight())
 
 
 def assert_only_counted(datagram: bytes) -> Counter[str]:
-    """The vehicle sends the same bytes at the same instants as without the datagram; what was counted."""
+    """Assert that the datagram changes nothing the vehicle sends, and is counted; returns the counts."""
     vehicle = in_flight()
     before = vehicle.counters.copy()
     vehicle.step([(datagram, START)], START)
@@ -102,7 +102,7 @@ FAULTY = [
 
 
 @pytest.mark.parametrize(("datagram", "reason"), FAULTY, ids=[reason for _, reason in FAULTY])
-def test_it_is_counted_by_its_reason_and_changes_nothing(datagram: bytes, reason: str) -> None:
+def test_a_faulty_datagram_is_counted_by_reason_and_changes_nothing(datagram: bytes, reason: str) -> None:
     assert assert_only_counted(datagram) == Counter({reason: 1})
 
 

@@ -23,7 +23,7 @@ def own_request(vehicle: Shell[Craft]) -> int:
 
 @every_kind
 def test_a_watching_system_is_not_the_station(make: Make) -> None:
-    """`gcs monitor` asks and answers TIMESYNC. Were that the station's voice, its vehicles would never end."""
+    """`gcs monitor` asks and answers TIMESYNC. If that counted as the station's voice, vehicles would never end."""
     vehicle = make()
     vehicle.step([(heartbeat(), START + SECOND)], START + SECOND)
     reply = dialect.MAVLink_timesync_message(tc1=7, ts1=own_request(vehicle)).pack(MONITOR)
@@ -57,7 +57,7 @@ def test_heartbeats_of_other_stations_are_counted(make: Make) -> None:
 
 @every_kind
 def test_frames_are_numbered_in_the_order_sent(make: Make) -> None:
-    """Commands are answered first and then followed by what they ask for or by words; nothing seems overtaken."""
+    """The ACK of a command comes before the message or text that it causes, so that no frame seems overtaken."""
     vehicle = make()
     asked = [
         arm(),
