@@ -30,7 +30,7 @@ OF_CLOCKS = ("clock_offset_s", "clock_offset_bound_s")
 """Known of every commanded vehicle; after its clock was set, only from the next exchange on."""
 COUNTS = ("received", "late", "duplicate")
 """These never decrease; `lost` does when a frame arrives late."""
-LEAST_CHANGE = 1e-6
+ROUNDING_SHARE = 1e-6
 """Fraction by which a limit may be exceeded: float32 on the wire rounds by 6e-8."""
 
 
@@ -46,13 +46,13 @@ def checked(flown: Flown) -> Iterator[Broken]:
     """Everything that does not hold in a flight."""
     limit = flown.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
     for asked in flown.set_points:
-        if asked.acceleration_m_s2 > limit * (1.0 + LEAST_CHANGE) or math.isinf(asked.velocity_m_s):
+        if asked.acceleration_m_s2 > limit * (1.0 + ROUNDING_SHARE) or math.isinf(asked.velocity_m_s):
             yield Broken("commands within limits", f"{asked} on the wire, limit {limit:g} m/s²")
             break
     sampled = instants(flown.truth, SAMPLED)
     for stretch in flown.stretches:
         commands = np.hypot(stretch.ticks["command_north_m_s2"], stretch.ticks["command_east_m_s2"])
-        if (commands > limit * (1.0 + LEAST_CHANGE)).any():
+        if (commands > limit * (1.0 + ROUNDING_SHARE)).any():
             yield Broken("commands within limits", f"{np.nanmax(commands):g} m/s² in the ticks, limit {limit:g}")
     for stretch, after in zip(flown.stretches, [*flown.stretches[1:], None], strict=True):
         yield from _rows_complete(flown, stretch)

@@ -75,7 +75,7 @@ class Flown:
     plan: FlightPlan
     stretches: list[Stretch]
     truth: np.ndarray[Any, Any]
-    """Records of sim_vehicles.truth.DTYPE."""
+    """Records of sim_vehicles.links.truth.DTYPE."""
     clocks: dict[int, BootClock]
     """Clocks of the vehicles at the start, by system id."""
     steps_ns: dict[int, int]
@@ -229,7 +229,7 @@ def _stretch(plan: FlightPlan, world: World, guard: Guard | None, start_ns: int,
         if now_ns >= until_ns:
             assert now_ns < until_ns + 20 * NS_PER_S, "the station does not end although it was told to"
             station.request_stop("soak: time is up")
-        if guard is None and station.next_event_ns > now_ns:  # else the step does more than to answer
+        if guard is None and station.next_event_ns > now_ns:  # otherwise the step does more than answer
             answers, _ = station.step(world.strangers(now_ns), now_ns)
             assert not answers, f"the station answers a stranger: {answers}"
     replaced = station.phase is not Phase.ENDED

@@ -19,7 +19,7 @@ VEHICLE_TICKS = 6_000
 SHORTEST_S, LONGEST_S = 4.0, 12.0
 MOST_VEHICLES = 12
 AUTOPILOT_START_S = 25.0
-"""Take-off and identification, for the budget."""
+"""Time for take-off and identification in the budget of ticks."""
 
 
 def random_scenario(rng: Rng, name: str) -> Part:
@@ -223,7 +223,7 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         execute_at=None,  # drawn later, as are the next two
         feed_forward=None,
         prediction=None,
-        for_link=None,  # gains are searched for seconds
+        for_link=None,  # the search for gains takes seconds
         link_headroom=None,
         controller=None,
         linear=None,

@@ -76,7 +76,7 @@ def test_a_wrong_value_in_one_row_is_seen(column: str, value: float, invariant: 
 
 
 @pytest.mark.parametrize(("telemetry_hz", "wrong_s"), [(50.0, 0.001), (10.0, 0.11), (10.0, 0.04)])
-def test_a_repetition_that_is_none_is_seen(telemetry_hz: float, wrong_s: float) -> None:
+def test_a_false_repetition_is_seen(telemetry_hz: float, wrong_s: float) -> None:
     flown = calm_flight(telemetry_hz)
     assert list(checked(flown)) == []
     [stretch] = flown.stretches
@@ -99,7 +99,7 @@ def test_an_unstable_loop_is_refused_unless_flying_it_is_allowed() -> None:
 @pytest.mark.parametrize(
     "reason", ["broken: vehicles 1 and 2 have collided, 0.3 m apart", "completed: duration reached"]
 )
-def test_an_end_that_is_not_so_in_truth_is_seen(reason: str) -> None:
+def test_a_false_reason_of_the_end_is_seen(reason: str) -> None:
     """Vehicles in their places have not collided, and vehicles far from their places have not settled."""
     flown = calm_flight()
     [stretch] = flown.stretches
