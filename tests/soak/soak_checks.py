@@ -285,8 +285,8 @@ def _was_opened(stretch: Stretch) -> bool:
 def _extrapolated_m(flown: Flown, stretch: Stretch, at_end: np.ndarray[Any, Any]) -> dict[int, float]:
     """How far each vehicle can be from its newest state extrapolated with its velocity.
 
-    With accelerations of at most A since a state of age T: A T² / 2, plus the speed times the error of T. A covers the
-    largest command, and what a vehicle does by itself: its own loop, and reaching a velocity.
+    With accelerations of at most A since a state of age T: twice A T² / 2, plus the speed times the error of T. A
+    covers the largest command, and what a vehicle does by itself: its own loop, and reaching a velocity.
     """
     scenario, ticks = flown.plan.scenario, stretch.ticks
     sent = np.hypot(ticks["command_north_m_s2"], ticks["command_east_m_s2"])

@@ -111,12 +111,12 @@ def test_heartbeats_of_another_station_do_not_keep_the_failsafe_away() -> None:
     take_off(vehicle)
     other = from_another(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
     for tenth in range(1, 60):
-        # Set-points go on, as of a station whose loop runs and whose heartbeat has stopped on purpose.
+        # the station's set-points go on, its heartbeat stops after a second
         time_ns = START + tenth * SECOND // 10
-        own = [(heartbeat(), time_ns)] if tenth <= 10 else []
-        vehicle.step([(other, time_ns), *own], time_ns)
-    assert vehicle.craft.flight.failsafe
-    assert vehicle.counters["heartbeats"] < 30
+        own = [setpoint(), heartbeat()] if tenth <= 10 else [setpoint()]
+        vehicle.step([(data, time_ns) for data in (other, *own)], time_ns)
+    assert vehicle.craft.flight.failsafe == "station heartbeat"
+    assert vehicle.counters["heartbeats"] == 10
 
 
 def test_after_the_station_has_been_silent_another_takes_over() -> None:
