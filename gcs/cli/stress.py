@@ -197,12 +197,13 @@ def _refuse_axes(given: list[tuple[str, str]], prediction: str, seeds: int, *, s
 def _refuse_vehicle(system_id: int, study: "Study", given: list[tuple[str, str]]) -> None:
     from gcs.plan.loops import plan_loops
 
-    known = [own for loop in plan_loops(study.plan) for own in loop.system_ids]
+    loops = plan_loops(study.plan)
+    known = [own for loop in loops for own in loop.system_ids]
     if system_id not in known:
         raise InputError(f"--onset-of: read {system_id}, wanted one of the system ids {' '.join(map(str, known))}")
     if given:
         raise InputError(f"read --onset-of and {given[0][0]}, wanted one of them")
-    shared = next(loop.system_ids for loop in plan_loops(study.plan) if system_id in loop.system_ids)
+    shared = next(loop.system_ids for loop in loops if system_id in loop.system_ids)
     if len(shared) > 1 and (study.real_time or study.plan.onboard is not None):
         place = "with --real-time" if study.real_time else "with loops on board"
         alone = f"a vehicle that shares its loop with no other (vehicles {' '.join(map(str, shared))} share one)"

@@ -61,7 +61,7 @@ def planned_loop_delays_s(plan: FlightPlan) -> dict[int, float]:
     A leader flown by somebody else has none.
     """
     expected_s = expected_loop_delays_s(plan.scenario, _heard(plan))
-    return {own: expected_s[own] for own in _planned_paths(plan)}
+    return {own: at_s for own, at_s in expected_s.items() if own != plan.scenario.external_id}
 
 
 def _heard(plan: FlightPlan) -> dict[int, set[int]]:
@@ -189,7 +189,7 @@ def setpoint_gaps(scenario: Scenario) -> float:
     The vehicle then enters failsafe. Neither outages of links nor bandwidth are included.
     """
     rng, often = np.random.default_rng(0), dict[Link, float]()
-    commanded = {vehicle.system_id for vehicle in scenario.vehicles} - {scenario.external_id}
+    commanded = [vehicle.system_id for vehicle in scenario.vehicles if vehicle.system_id != scenario.external_id]
     downs = [scenario.link_of(system_id)[1] for system_id in commanded]
     for down in dict.fromkeys(downs):
         enters_s, late_s = _set_points(scenario, down, rng)

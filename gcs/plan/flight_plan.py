@@ -128,13 +128,13 @@ class FlightPlan:
     def all_late(self) -> bool:
         """Whether all feedback acts after the loop delay: x' = A x + B K x(t - tau).
 
-        It does not with a loop on board, which closes part of it at once, nor with prediction.
+        With a loop on board, a vehicle's own errors act at once. With prediction, predicted states are fed back.
         """
         return self.onboard is None and self.scenario.control.prediction == "off"
 
     @property
     def response_is_known(self) -> bool:
-        """Whether the vehicles' response is immediate, given, or identified: that of an autopilot is, in flight."""
+        """Whether the vehicles' response is known: immediate, given or, of autopilots in flight, identified."""
         return self.responses is not None or not self.scenario.starts_on_ground
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":

@@ -148,7 +148,7 @@ def check(plan: FlightPlan) -> ScenarioCheck:
         north_m, east_m = place[row].tolist()
         turning = (limits.turn_rate_max_rad_s or inf) * hypot(*vehicle.velocity_ne_m_s)
         most = min(limits.acceleration_max_m_s2 or inf, turning)
-        own = vehicle.system_id
+        at_s = delays_s.get(vehicle.system_id)
         vehicles.append(
             VehicleCheck(
                 system_id=vehicle.system_id,
@@ -157,9 +157,9 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 spacing_error_m=float(hypot(*errors[model.spacing_slice(row)])) if row else None,
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
-                expected_loop_delay_s=delays_s.get(own),
-                headroom=_known(_headroom(plan, row, at_s, at_s)) if (at_s := delays_s.get(own)) is not None else None,
-                link_delay_left_s=_known(left_s.get(own, inf)),
+                expected_loop_delay_s=at_s,
+                headroom=None if at_s is None else _known(_headroom(plan, row, at_s, at_s)),
+                link_delay_left_s=_known(left_s.get(vehicle.system_id, inf)),
             )
         )
     delay_s = max(delays_s.values())

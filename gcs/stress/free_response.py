@@ -157,8 +157,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         scenario = scenario.model_copy(update={"clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})})
     elif isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
-    pushed = scenario.disturbance
-    linear = Disturbance(sector=pushed.sector) if pushed is not None and pushed.sector is not None else None
+    sector = scenario.disturbance and scenario.disturbance.sector
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []
     for vehicle in scenario.vehicles:
@@ -180,7 +179,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "vehicles": tuple(vehicles),
         "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
         "duration_s": duration_s,
-        "disturbance": linear,
+        "disturbance": sector and Disturbance(sector=sector),  # it depends on the errors, so it is part of the loop
         "navigation": None,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(

@@ -234,7 +234,7 @@ def _percentile(values: FloatArray, percent: float) -> float | None:
 
 
 def _displaced(scenario: Scenario) -> Scenario:
-    """The scenario with initial errors, and without pushes and navigation errors, which would keep up errors."""
+    """The scenario with initial errors, and without disturbances and navigation errors, which would outlast them."""
     vehicles = [
         vehicle.model_copy(update={"position_ne_m": (north, east + _START_ERROR_M * (k % 2))})
         for k, vehicle in enumerate(scenario.vehicles)
