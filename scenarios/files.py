@@ -182,7 +182,7 @@ def _contradictions(scenario: Scenario) -> Iterator[Fault]:
     yield from _monitor_contradictions(scenario)
     yield from _onboard_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
-    if scenario.autopilot.sitl != Sitl() and scenario.dynamics != "autopilot":
+    if scenario.autopilot.sitl != Sitl() and scenario.simulated_autopilot is None:
         yield "autopilot.sitl", scenario.autopilot.sitl.model_dump(), "no such key without dynamics autopilot"
     yield from _sector_contradictions(scenario)
     limits = scenario.limits

@@ -7,7 +7,7 @@ The docstring below a key describes it in `scenario.schema.json` and the referen
 """
 
 from collections.abc import Callable
-from math import inf
+from math import ceil, inf
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -418,6 +418,11 @@ class Scenario(Part):
         return self.dynamics == "autopilot"
 
     @property
+    def simulated_autopilot(self) -> Autopilot | None:
+        """The autopilot of the simulated vehicles; None if they have none."""
+        return self.autopilot if self.dynamics == "autopilot" else None
+
+    @property
     def has_altitude_slots(self) -> bool:
         """Whether vehicles fly at different altitudes."""
         return len({self.altitude_of(vehicle) for vehicle in self.vehicles}) > 1
@@ -435,6 +440,18 @@ class Scenario(Part):
         """The same scenario with a monitor that only watches, and without slower gains to switch to."""
         monitor = self.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
         return self.model_copy(update={"monitor": monitor})
+
+    def at_rates(self, *, control_hz: float, telemetry_hz: float) -> Self:
+        """The same scenario at other rates.
+
+        Sensor and loop on board run at the lowest multiples of the control rate that are no slower than their own.
+        """
+        rates = self.rates.model_copy(update={"control_hz": control_hz, "telemetry_hz": telemetry_hz})
+        if self.control.loop != "onboard":
+            return self.model_copy(update={"rates": rates})
+        sensor_hz = control_hz * ceil(self.onboard.sensor_hz / control_hz)
+        onboard = {"sensor_hz": sensor_hz, "rate_hz": sensor_hz * ceil(self.onboard.rate_hz / sensor_hz)}
+        return self.model_copy(update={"rates": rates, "onboard": self.onboard.model_copy(update=onboard)})
 
     def with_link_delay(self, *, up_s: float | None, down_s: float | None) -> Self:
         """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is.

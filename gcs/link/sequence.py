@@ -5,8 +5,8 @@ import numpy as np
 from scenarios.kernel import Cell, Columns, Record, Records, at_row, kernel
 from scenarios.schema import NS_PER_S
 
-_KEPT = 128
-"""How far back the sequence counter remembers which frames arrived."""
+_KEPT = 64
+"""The counter remembers which of this many newest frames arrived: one bit each."""
 NEW, LATE, DUPLICATE = 0, 1, 2
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
@@ -20,8 +20,6 @@ farther frames have recently been overtaken, the smaller this allowance, down to
 _MOST = 0xFFFFFFFF
 """The largest count that the tick record holds. Without this limit, a log whose clock jumps by centuries exceeds it."""
 _FORGET = 1.0 / 512
-_LONGEST = 9e18
-"""Upper limit of expected frames times 1e9; beyond it more than `_MOST` are lost, so their number does not matter."""
 _RUN, _RUN_STEP = 8, 4
 """`_RUN` late frames in a row, each at most `_RUN_STEP` newer than the last, are new after all: an earlier, very late
 frame was mistaken for a new one."""
@@ -32,7 +30,7 @@ COUNTER = np.dtype(
         ("received", "i8"), ("lost", "i8"), ("late", "i8"), ("duplicate", "i8"),
         ("last", "i8"),  # sequence number of the last frame
         ("newest", "i8"), ("newest_ns", "i8"),  # newest frame: its number, wraps undone (-1: none yet), and its time
-        ("seen", "u8"), ("seen_before", "u8"),  # bit k is set if frame newest - k, or newest - 64 - k, has arrived
+        ("seen", "u8"),  # bit k is set if frame newest - k has arrived
         ("run", "i8"),  # late frames in a row, each a little newer than the last
         ("lag", "f8"),  # by how many numbers frames have recently been overtaken
         ("rate_hz", "f8"), ("rate_count", "i8"), ("rate_ns", "i8"), ("steady_frames", "f8"), ("steady_ns", "f8"),
@@ -54,8 +52,7 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
         counter.seen = 1
         return NEW
     since_ns = max(0, time_ns - counter.newest_ns)  # in a log the clock may have been set back
-    expected = counter.rate_hz * since_ns
-    passed = int(min(expected, _LONGEST)) // NS_PER_S
+    passed = int(min(counter.rate_hz * since_ns, float(_MOST * NS_PER_S))) // NS_PER_S
     most = passed + max(_LEAST_AHEAD, _AHEAD - int(counter.lag))
     ahead = most - ((most - sequence + counter.newest) & 0xFF)
     if ahead <= 0 and 0 < step <= _RUN_STEP:
@@ -68,24 +65,18 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
     counter.lag = max(counter.lag * (1.0 - _FORGET), float(-ahead))
     if ahead > 0:
         counter.lost = min(counter.lost + ahead - 1, _MOST)
-        _see_next(counter, ahead)
+        counter.newest += ahead
+        counter.seen = (counter.seen << np.uint64(ahead) if ahead < _KEPT else np.uint64(0)) | np.uint64(1)
         _note_rate(counter, time_ns)
         counter.newest_ns = time_ns
         return NEW
-    back = -ahead
-    seen, place = counter.seen, back
-    if back >= 64:
-        seen, place = counter.seen_before, back - 64
-    bit = np.uint64(1) << np.uint64(place) if back < _KEPT else np.uint64(0)
-    if seen & bit:
+    bit = np.uint64(1) << np.uint64(-ahead) if -ahead < _KEPT else np.uint64(0)
+    if counter.seen & bit:
         counter.duplicate += 1
         return DUPLICATE
     counter.late += 1
     counter.lost = max(0, counter.lost - 1)
-    if back >= 64:
-        counter.seen_before |= bit
-    else:
-        counter.seen |= bit
+    counter.seen |= bit
     return LATE
 
 
@@ -94,24 +85,8 @@ def restart(counter: Record) -> None:
     """Treat the next frame as the first: the sender has restarted."""
     counter.newest = -1
     counter.newest_ns = counter.rate_ns = counter.rate_count = counter.run = counter.last = 0
-    counter.seen = counter.seen_before = 0
+    counter.seen = 0
     counter.rate_hz = counter.lag = counter.steady_frames = counter.steady_ns = 0.0
-
-
-@kernel
-def _see_next(counter: Record, ahead: int) -> None:
-    """Record the arrival of the frame that is `ahead` numbers newer than the newest."""
-    counter.newest += ahead
-    if ahead >= _KEPT:
-        counter.seen = counter.seen_before = 0
-    elif ahead >= 64:
-        counter.seen_before = counter.seen << np.uint64(ahead - 64)
-        counter.seen = 0
-    else:
-        carried = counter.seen >> np.uint64(64 - ahead)
-        counter.seen_before = counter.seen_before << np.uint64(ahead) | carried
-        counter.seen = counter.seen << np.uint64(ahead)
-    counter.seen |= np.uint64(1)
 
 
 @kernel
@@ -144,7 +119,7 @@ class SequenceCounter:
     A sequence number holds 8 bits of the count; time gives the rest. A frame can be only slightly newer than the frame
     rate suggests; one that seems newer than that is an old one. So a swapped pair is one late frame, not 254 lost ones,
     and all losses of a minute's outage are counted. A frame overtaken by more than 223 others is miscounted. A late
-    frame is no longer counted as lost once it arrives.
+    frame is no longer counted as lost once it arrives. A copy that arrives after 64 newer frames counts as late.
     """
 
     received = Cell[int]()

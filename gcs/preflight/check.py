@@ -269,9 +269,10 @@ def _known(value: float) -> float | None:
 
 
 def _response_differs(scenario: Scenario) -> dict[str, tuple[float | None, float | None]]:
-    if scenario.response is None or scenario.dynamics != "autopilot":
+    own = scenario.simulated_autopilot
+    if scenario.response is None or own is None:
         return {}
-    both = {key: (value, getattr(scenario.autopilot, key)) for key, value in scenario.response.model_dump().items()}
+    both = {key: (value, getattr(own, key)) for key, value in scenario.response.model_dump().items()}
     return {key: (given, simulated) for key, (given, simulated) in both.items() if given != simulated}
 
 

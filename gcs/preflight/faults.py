@@ -93,9 +93,10 @@ def bad_start(scenario: Scenario) -> str | None:
             wanted = f"at least safety.collision_distance_m = {least_m:g} m between any two"
             return f"vehicle {two.system_id}: position_ne_m: read {read}, wanted {wanted}"
     speeds_m_s = [("nominal_velocity", hypot(*entry.velocity_ne_m_s)) for entry in scenario.nominal_velocity]
+    own = scenario.simulated_autopilot
     for key, speed_m_s in (*speeds_m_s, ("course.speed_m_s", scenario.course.speed_m_s or 0.0)):
-        if scenario.dynamics == "autopilot" and speed_m_s > scenario.autopilot.speed_max_m_s:
-            wanted = f"at most autopilot.speed_max_m_s = {scenario.autopilot.speed_max_m_s:g} m/s"
+        if own is not None and speed_m_s > own.speed_max_m_s:
+            wanted = f"at most autopilot.speed_max_m_s = {own.speed_max_m_s:g} m/s"
             return f"{key}: read {speed_m_s:g} m/s, wanted {wanted}"
     place = {vehicle.system_id: vehicle.position_ne_m for vehicle in vehicles}
     for vehicle, offset in zip(vehicles, offset_ne_m.tolist(), strict=True):

@@ -10,7 +10,6 @@ link crossed a whole period.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -145,14 +144,9 @@ def split_delay(total_s: float, period_s: float) -> tuple[float, float]:
 
 
 def _with_rate(scenario: Scenario, hz: float) -> Scenario:
-    rates, own = scenario.rates, scenario.onboard
-    telemetry_hz = hz if rates.telemetry_hz == rates.control_hz else rates.telemetry_hz
-    update: dict[str, Any] = {"rates": rates.model_copy(update={"control_hz": hz, "telemetry_hz": telemetry_hz})}
-    if scenario.control.loop == "onboard":
-        factor = hz / rates.control_hz
-        on_board = {"rate_hz": own.rate_hz * factor, "sensor_hz": own.sensor_hz * factor}
-        update["onboard"] = own.model_copy(update=on_board)
-    return scenario.model_copy(update=update)
+    rates = scenario.rates
+    same = rates.telemetry_hz == rates.control_hz
+    return scenario.at_rates(control_hz=hz, telemetry_hz=hz if same else rates.telemetry_hz)
 
 
 def _with_jitter(link: Link, scale_s: float) -> Link:

@@ -126,8 +126,8 @@ def response_paired(
 
 def _linear_range(plan: FlightPlan) -> tuple[float, float]:
     """The velocity error (m/s) and the command (m/s²) up to which the loop is linear."""
-    if plan.scenario.dynamics == "autopilot":
-        return np.inf, _LIMIT_SHARE * plan.scenario.autopilot.acceleration_max_m_s2
+    if (own := plan.scenario.simulated_autopilot) is not None:
+        return np.inf, _LIMIT_SHARE * own.acceleration_max_m_s2
     error_m_s = linear_error_m_s(plan.scenario)
     return error_m_s if is_modelled(plan) else min(error_m_s, _SMALL_M_S), LINEAR_COMMAND_M_S2
 

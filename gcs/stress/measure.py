@@ -152,7 +152,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 def _amplitudes(plan: FlightPlan) -> Sequence[float]:
     """Initial errors of a probe, in order. A user's own law or an autopilot may be linear for small ones only."""
-    return AMPLITUDES if is_modelled(plan) and plan.scenario.dynamics != "autopilot" else AMPLITUDES[1:]
+    return AMPLITUDES if is_modelled(plan) and plan.scenario.simulated_autopilot is None else AMPLITUDES[1:]
 
 
 def _folder_of(folder: Path | None, amplitude: float) -> Path | None:

@@ -169,7 +169,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
 
     Raises GainsError if no gains meet the scenario's requirement at this rate, or given gains are unstable at it.
     """
-    formed = with_vehicles(_at_rate(scenario.with_calm_monitor(), rate_hz), vehicles)
+    formed = with_vehicles(scenario.with_calm_monitor().at_rates(control_hz=rate_hz, telemetry_hz=rate_hz), vehicles)
     _, plan = flight_plan(_displaced(formed))
     if (unstable := unstable_loop(plan)) is not None:
         raise GainsError(unstable)
@@ -196,19 +196,6 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         reason=_reason(station.end_reason, error_end_m, headroom_p01),
         holds=completed and error_end_m < _DECAYED * _START_ERROR_M and headroom_p01 is not None and headroom_p01 > 0.0,
     )
-
-
-def _at_rate(scenario: Scenario, rate_hz: float) -> Scenario:
-    """The scenario with telemetry and control at this rate.
-
-    Sensor and loop on board run at the lowest multiples of it that are no slower than the scenario's own rates.
-    """
-    rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
-    if scenario.control.loop != "onboard":
-        return scenario.model_copy(update={"rates": rates})
-    sensor_hz = rate_hz * ceil(scenario.onboard.sensor_hz / rate_hz)
-    onboard = {"sensor_hz": sensor_hz, "rate_hz": sensor_hz * ceil(scenario.onboard.rate_hz / sensor_hz)}
-    return scenario.model_copy(update={"rates": rates, "onboard": scenario.onboard.model_copy(update=onboard)})
 
 
 def _reason(end_reason: str, error_end_m: float, headroom_p01: float | None) -> str:

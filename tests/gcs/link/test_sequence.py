@@ -39,6 +39,16 @@ def test_duplicates_are_counted_apart() -> None:
     assert counts(counted([0, 1, 1, 2, 0, 3])) == (6, 0, 0, 2)
 
 
+@pytest.mark.parametrize(("newer", "late", "duplicate"), [(63, 0, 1), (64, 1, 0)])
+def test_copies_are_recognised_among_the_newest_sixty_four_frames(newer: int, late: int, duplicate: int) -> None:
+    assert counts(counted([*range(newer + 1), 0])) == (newer + 2, 0, late, duplicate)
+
+
+def test_a_clock_that_jumps_by_centuries_fills_the_count() -> None:
+    centuries_ms = 2e2 * 365 * 24 * 3600 * 1e3
+    assert counted(list(range(101)), [*(20.0 * n for n in range(100)), centuries_ms]).lost == 2**32 - 1
+
+
 @given(st.integers(0, 2**32), st.floats(0.0, 0.6))
 def test_random_losses_are_counted_exactly(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)

@@ -1,11 +1,14 @@
 """What is varied in a campaign, and how it changes a scenario."""
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.errors import InputError
 from gcs.stress.axes import at_coordinates, has_constant_links, parse_axis, split_delay
+from scenarios.files import with_loop
 from scenarios.keys.link import Jitter, Link, LossBursts
 from tests.support.fleets.stress_pair import SCENARIO
 
@@ -69,6 +72,14 @@ def test_loss_takes_the_place_of_bursts(loss: float) -> None:
     bursty = Link(loss_bursts=LossBursts(to_bad_probability=0.02, to_good_probability=0.5))
     own = SCENARIO.model_copy(update={"links": SCENARIO.links.model_copy(update={"up": bursty, "down": bursty})})
     assert at_coordinates(own, {"loss": loss}).link_of(1) == (Link(loss_probability=loss),) * 2
+
+
+@pytest.mark.parametrize(("hz", "sensor_hz", "rate_hz"), [(10.0, 50.0, 100.0), (40.0, 80.0, 160.0)])
+def test_loop_on_board_is_no_slower_at_any_rate(hz: float, sensor_hz: float, rate_hz: float) -> None:
+    own = with_loop(SCENARIO, "onboard", Path("here.toml"))
+    assert (own.onboard.sensor_hz, own.onboard.rate_hz) == (50.0, 100.0)
+    onboard = at_coordinates(own, {"rate": hz}).onboard
+    assert (onboard.sensor_hz, onboard.rate_hz) == (sensor_hz, rate_hz)
 
 
 def test_a_slower_telemetry_rate_of_its_own_stays() -> None:
