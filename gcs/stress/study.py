@@ -86,7 +86,8 @@ class Onset:
     Delays are loop delays of the vehicle that breaks first. Only `link_delay_s` is a link delay, up plus down: the loop
     delay minus `waiting_s`, the median wait of the flights. `link_delay_range_s` holds the link delays by their longest
     and their shortest wait; `waits_for` says in words what datagrams wait for. `predicted_s` is the sampled margin of
-    the design or, with prediction, the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
+    the design or, with prediction, the end of its mismatch window; for a loop shared over different links it is where
+    the growth predicted for the flights passes zero. `difference` is `loop_delay_s` / `predicted_s` − 1.
     `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. The predictions are
     None without a linear model: for a nonlinear law, or for the user's own dynamics.
 
@@ -326,13 +327,13 @@ def _found(
     own_s = block.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
     continuous_s = block.window_continuous_s()[end] if is_modelled(study.plan) else None
-    if vehicle is not None and len(block.system_ids) > 1:  # the margin depends on the delays of the others
+    seed, at_onset = study.plan.scenario.seed, slowed.at(round(zero.varied - waiting_s, 6))
+    slowed_links = at_coordinates(study.plan.scenario, at_onset)
+    if len({slowed_links.link_of(own) for own in block.system_ids}) > 1:  # the margin depends on the delays of all
         predicted_s, continuous_s = (
             _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")
         )
     link_s = zero.varied - waiting_s
-    seed = study.plan.scenario.seed
-    at_onset = slowed.at(round(link_s, 6))
     others = [unlike.system_ids[0] for unlike in first_of_each_kind(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     others = [own for own in others if vehicle is None or own not in block.system_ids]

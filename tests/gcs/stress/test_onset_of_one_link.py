@@ -56,7 +56,7 @@ def study_of(scenario: Scenario) -> Study:
     return Study(flight_plan(scenario.with_calm_monitor())[1])
 
 
-def onset_of(scenario: Scenario, vehicle: int) -> Onset:
+def onset_of(scenario: Scenario, vehicle: int | None = None) -> Onset:
     return find_onset(study_of(scenario), lambda trials: list(map(fly_trial, trials)), tolerance=0.02, vehicle=vehicle)
 
 
@@ -92,6 +92,17 @@ def test_the_vehicle_that_waits_is_the_slowest_of_its_loop() -> None:
     found = fly_trial(study.trial("probe", {"delay": 0.2}, seed=1))
     assert found.critical == 3
     assert known(found.waiting_s) > 0.06  # two mean jitters, and part of a period of 20 ms
+
+
+def test_a_jittery_link_in_a_loop_moves_the_predicted_onset() -> None:
+    """All links are slowed alike, but one vehicle waits longer: the margin for equal delays is 8 % off."""
+    late = Link(delay_s=0.02, jitter=Jitter(distribution="uniform", scale_s=0.06))
+    scenario = with_links(load(located("chain3_bidirectional")), all=0.02)
+    own = VehicleLinks(system_id=3, up=late, down=late)
+    onset = onset_of(scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (own,)})}))
+    assert (onset.critical, onset.loop) == (3, (1, 2, 3))
+    assert onset.loop_delay_s > 1.05 * study_of(scenario).plan.delay_margin_s
+    assert onset.loop_delay_s == pytest.approx(known(onset.predicted_s), abs=3.0 * onset.error_s)
 
 
 def test_states_of_one_age_leave_one_delay_for_each_command() -> None:
