@@ -1,5 +1,6 @@
 """The value that a scenario's design reaches for every criterion."""
 
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -34,13 +35,18 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
     figures = _figures(design, scenario)
     if figures is None or figures.model.states > most_states or figures.decay_rate_1_s <= 0.0:
         return None
+    spacing_gain_s2 = plain(figures.spacing_gain_max_s2)
+    delay_s = figures.delay_s or 0.0
+    if figures.timing.all_late and figures.is_stable_at_delay != (delay_s < figures.delay_margin_s):
+        # so slow a rate that half a hold as delay misjudges stability
+        figures, spacing_gain_s2 = replace(figures, discrete=True), None
     return CriteriaPart(
-        at_delay_s=figures.delay_s or 0.0,
+        at_delay_s=delay_s,
         damping=figures.damping_min,
         natural_frequency_rad_s=figures.natural_frequency_max_rad_s,
         alpha_at_delay=figures.alpha_at_delay,
         decay_rate_at_delay_1_s=figures.decay_rate_at_delay_1_s,
-        spacing_gain_s2=plain(figures.spacing_gain_max_s2),
+        spacing_gain_s2=spacing_gain_s2,
         noise_gain=plain(figures.noise_gain_max) if figures.timing.all_late else None,
         weight=figures.weight or (1.0, 1.0),
     )

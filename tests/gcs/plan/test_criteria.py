@@ -41,6 +41,19 @@ def test_every_design_reports_its_criteria() -> None:
         assert "which no controller exceeds" in printed.get()
 
 
+@pytest.mark.parametrize(("rate_hz", "decay_1_s"), [(1.0, 0.020), (2.0, 0.030)])
+def test_a_stable_loop_decays_at_slow_rates_too(rate_hz: float, decay_1_s: float) -> None:
+    """Half a hold as delay calls these loops unstable; flights decay, as the sampled margin says."""
+    scenario = load(SCENARIOS / "chain3.toml").at_rates(control_hz=rate_hz, telemetry_hz=rate_hz)
+    found = flight_plan(scenario)[0]
+    assert found.criteria is not None
+    assert found.delay_margin_s is not None
+    assert found.criteria.at_delay_s < found.delay_margin_s
+    assert found.criteria.decay_rate_at_delay_1_s == pytest.approx(decay_1_s, abs=5e-4)
+    assert 0.0 < found.criteria.alpha_at_delay < 0.03
+    assert found.criteria.spacing_gain_s2 is None
+
+
 def test_a_scenario_is_designed_for_its_delay() -> None:
     keys = '[control.criteria]\nat_delay_s = 0.3\nmaximise = "decay_rate_at_delay_1_s"'
     scenario = parse(chain_with(keys), Path("scenario.toml"))
