@@ -175,7 +175,7 @@ def _form(data: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _forms() -> str:
-    return " or ".join(", ".join(form) for form in _FORMS)
+    return "; or ".join(", ".join(form) for form in _FORMS)
 
 
 def _terms_model(terms: Any) -> DelayModel:

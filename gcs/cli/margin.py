@@ -162,8 +162,8 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
         console.print(f"{by}{line}")
     if margin.crossings:
         columns: dict[str, Callable[[MarginCrossing], str]] = {
-            # the frequency has about the same relative error as the delay
-            "omega rad/s": lambda c: as_known(c.omega_rad_s, c.delay_error_s / max(c.delay_s, 1e-300) * c.omega_rad_s),
+            # the relative error of the frequency is about the error of the phase
+            "omega rad/s": lambda c: as_known(c.omega_rad_s, c.delay_error_s * c.omega_rad_s**2),
             "period s" if margin.unknown == "period" else "delay s": lambda c: as_known(c.delay_s, c.delay_error_s),
             "roots go": lambda c: {1: "right: unstable", -1: "left: stable", 0: "touch"}[c.direction],
         }

@@ -71,7 +71,7 @@ def test_held_loop_may_state_its_period() -> None:
         ('{"A0": [[1]],\n', "line 2: read nothing more, wanted JSON"),
         ('{"A0":\r\n [[1,,2]],\n', "line 2: read '[[1,,2]],', wanted JSON"),
         ("[]", "the model: read [], wanted an object"),
-        ("{}", "read the keys none; wanted A0, A1 or terms or A, B, K, hold or A, B, K, hold, period"),
+        ("{}", "read the keys none; wanted A0, A1; or terms; or A, B, K, hold; or A, B, K, hold, period"),
         ('{"A0": [[1]]}', "read the keys A0; wanted A0, A1"),
         ('{"A0": [[1]], "A1": [[1]], "A2": [[1]]}', "'A2': read an unknown key, wanted A0, A1"),
         ('{"A0": [[1]], "A0": [[1]], "A1": [[1]]}', "A0: read twice, wanted once"),

@@ -50,6 +50,14 @@ def test_command_prints_a_table(tmp_path: Path) -> None:
     assert "right: unstable" in done.stdout
 
 
+def test_a_crossing_without_delay_shows_its_whole_frequency(tmp_path: Path) -> None:
+    """x'' + x = 0.2 x(t - tau) has roots at ± i sqrt(0.8) without delay."""
+    file = tmp_path / "oscillator.json"
+    file.write_text(json.dumps({"A0": [[0.0, 1.0], [-1.0, 0.0]], "A1": [[0.0, 0.0], [0.2, 0.0]]}))
+    [row] = [line.split() for line in run(str(file)).stdout.splitlines() if "left: stable" in line]
+    assert row[:2] == [f"{sqrt(0.8):.6g}", "0"]
+
+
 def test_command_ends_with_2_and_one_line_on_bad_input(tmp_path: Path) -> None:
     file = tmp_path / "bad.json"
     file.write_text('{"A0": [[1, 2]], "A1": [[1]]}')
