@@ -217,7 +217,7 @@ def _not_located(flights: Sequence[Outcome], scattered: Zero | None, *, shorter:
     count = f"{len(flights)} flight{'s' * (len(flights) != 1)}"
     flown = f"in {count} with {min(flown_s):.3f} to {max(flown_s):.3f} s of link delay"
     if not shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) > 0.0 for own in flights):
-        return NoOnset(f"{_AT_ONCE}: errors grow {flown}")
+        return NoOnset(f"{_AT_ONCE}: errors grow {flown}, and waiting alone takes {_waiting_s(flights):.3f} s")
     if shorter and min(flown_s) == 0.0 and all((own.growth_1_s or 0.0) < 0.0 for own in flights):
         expected = all((own.predicted_growth_1_s or 0.0) < 0.0 for own in flights)
         return NoOnset(f"{_NONE_SHORT}: errors decay {flown}", as_predicted=expected)
