@@ -327,13 +327,13 @@ def _found(
     own_s = block.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
     continuous_s = block.window_continuous_s()[end] if is_modelled(study.plan) else None
-    seed, at_onset = study.plan.scenario.seed, slowed.at(round(zero.varied - waiting_s, 6))
+    seed, link_s = study.plan.scenario.seed, zero.varied - waiting_s
+    at_onset = slowed.at(round(link_s, 6))
     slowed_links = at_coordinates(study.plan.scenario, at_onset)
     if len({slowed_links.link_of(own) for own in block.system_ids}) > 1:  # the margin depends on the delays of all
         predicted_s, continuous_s = (
             _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")
         )
-    link_s = zero.varied - waiting_s
     others = [unlike.system_ids[0] for unlike in first_of_each_kind(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     others = [own for own in others if vehicle is None or own not in block.system_ids]

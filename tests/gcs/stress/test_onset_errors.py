@@ -101,7 +101,11 @@ def test_a_probe_that_grows_before_the_onset_contradicts_it(
     ("waiting_s", "spread_s", "said"),
     [
         (0.3, 0.2, r"breaks without any link delay: growth passes zero at 0\.2.* s ± .* s of loop delay, and waiting"),
-        (0.35, 0.0, r"the formation breaks without any link delay: errors grow in \d+ flights with 0\.000 to .* waiting"),
+        (
+            0.35,
+            0.0,
+            r"the formation breaks without any link delay: errors grow in \d+ flights with 0\.000 to .* waiting",
+        ),
     ],
 )
 def test_an_onset_that_waiting_exceeds_is_not_a_link_delay(waiting_s: float, spread_s: float, said: str) -> None:
