@@ -339,7 +339,8 @@ def _found(
     others = [own for own in others if vehicle is None or own not in block.system_ids]
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     # with prediction, stay away from the other end of the window
-    aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
+    assumed_s = study.plan.assumed_s
+    aside_s = 0.1 * link_s if assumed_s is None or np.isnan(predicted_s) else 0.5 * abs(predicted_s - assumed_s)
     beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
     own = run([study.trial("own", slowed.at(delay_s), seed=seed) for delay_s in beside_s])
     links = () if vehicle is None else study.plan.scenario.link_of(vehicle)

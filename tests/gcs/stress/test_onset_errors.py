@@ -104,7 +104,7 @@ def test_a_probe_that_grows_before_the_onset_contradicts_it(
         (
             0.35,
             0.0,
-            r"the formation breaks without any link delay: errors grow in \d+ flights with 0\.000 to .* waiting",
+            r"breaks without any link delay: errors grow in \d+ flights with 0\.000 to .* waiting",
         ),
     ],
 )
