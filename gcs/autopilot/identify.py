@@ -39,6 +39,8 @@ _FEWEST_SAMPLES = 42
 _BOUNDS = np.log([(0.01, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
 """Bounds of lag, velocity gain, dead time and natural frequency, as logarithms."""
 _USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
+_GAIN = 1
+"""Place of the velocity gain among them."""
 _STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2
 _RESOLUTION = 1e-3
 """Misfits that differ by less than this fraction of the velocity do not distinguish models."""
@@ -108,6 +110,8 @@ class Flown:
     """Instants (n,) of the samples, relative to when the first command acted, from 0 to m periods."""
     velocity_m_s: FloatArray
     """In the direction of the manoeuvre. Its mean, such as a drift, is ignored."""
+    velocity_commanded: bool = True
+    """Whether set-points carry a velocity, too; without one, nothing follows it and the velocity gain is 0."""
 
     @property
     def has_too_few_samples(self) -> bool:
@@ -174,7 +178,7 @@ def identify(flown: Flown) -> Generator[None, None, Identified | None]:
             first = np.clip(np.log([0.6 * lag, gain, 0.4 * lag, 1.6 / lag]), *_BOUNDS.T)
     rms = {name: float(np.sqrt(np.square(rest).mean())) / size for name, (_, rest) in found.items()}
     name = _chosen(rms, found[min(rms, key=rms.__getitem__)][1])
-    return Identified(_response(name, found[name][0]), rms[name], flown.sample_s.size, rms)
+    return Identified(_response(flown, name, found[name][0]), rms[name], flown.sample_s.size, rms)
 
 
 def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
@@ -189,21 +193,23 @@ def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
     return min(rms, key=criterion)
 
 
-def _response(name: str, logs: FloatArray) -> Response:
+def _response(flown: Flown, name: str, logs: FloatArray) -> Response:
     lag_s, gain, dead_time_s, natural = np.exp(logs).tolist()
+    gain *= flown.velocity_commanded
     late_s = dead_time_s if name == "lag with dead time" else 0.0
     return Response(lag_s, gain, late_s, natural if name == "second order" else None)
 
 
 def _misfit(flown: Flown, name: str, logs: FloatArray) -> FloatArray:
     """Modelled minus measured velocity, both without their means, for each row of parameters."""
-    velocity = flown.velocities([_response(name, row) for row in logs]) - flown.velocity_m_s
+    velocity = flown.velocities([_response(flown, name, row) for row in logs]) - flown.velocity_m_s
     return velocity - velocity.mean(axis=1, keepdims=True)
 
 
 def _descent(flown: Flown, name: str, start: FloatArray) -> Generator[None, None, tuple[FloatArray, FloatArray]]:
     """Levenberg-Marquardt fit of a model, a few steps at a time; returns parameters and residuals."""
-    used, x, damping = _USED[name], start.copy(), 1e-3
+    used = [i for i in _USED[name] if i != _GAIN or flown.velocity_commanded]
+    x, damping = start.copy(), 1e-3
     nudges = _NUDGE * np.eye(x.size)[used]
     rest = np.empty(0)
     for step_number in range(_STEPS):

@@ -17,7 +17,7 @@ from gcs.plan.flight_plan import at_once
 from gcs.plan.planner import flight_plan
 from gcs.runs.grade import commands_of
 from gcs.runs.record import END
-from scenarios.keys.own import BUILT_IN
+from scenarios.keys.own import BUILT_IN, names_code
 from scenarios.schema import Clocks, Control, FixedGains, Limits, Links, NominalVelocity, Scenario
 
 _AXES = "along", "across"
@@ -77,7 +77,8 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
     )
     sample_s = instants_s[:, 1] - instants_s[0, 0]
     inside = sample_s >= 0.0
-    found = at_once(identify(Flown(1.0 / alone.rates.control_hz, command, sample_s[inside], velocity[inside])))
+    period_s, velocity_commanded = 1.0 / alone.rates.control_hz, not names_code(scenario.dynamics)
+    found = at_once(identify(Flown(period_s, command, sample_s[inside], velocity[inside], velocity_commanded)))
     if found is None or found.misfit > MISFIT_MAX:
         read = "no motion"
         if found is not None:

@@ -49,6 +49,22 @@ def test_a_known_lag_is_found_again(tmp_path: Path) -> None:
         assert found.misfit < 0.002
 
 
+def test_no_velocity_gain_is_found_where_none_is_accepted(tmp_path: Path) -> None:
+    # once, a vehicle that responds at once was given 10 1/s, which every other command refused
+    (tmp_path / "at_once.py").write_text(
+        "import numpy as np\n\ndef step(state, command, dt_s, memory):\n"
+        "    moved = dt_s * state[2:] + dt_s**2 / 2 * command\n"
+        "    return np.concatenate([state[:2] + moved, state[2:] + dt_s * command])\n"
+    )
+    text = TEXANS.replace('"jsbsim"', '"at_once.py:step"')
+    file = tmp_path / "at_once.toml"
+    file.write_text(text)
+    found = responses_of(load(file))
+    assert all(one.response.velocity_gain_1_s == 0.0 and one.misfit < 0.01 for one in found.values())
+    file.write_text(text + as_toml(found))
+    assert load(file).response is not None
+
+
 def test_aircraft_flies_to_the_margin_computed_with_its_identified_response() -> None:
     scenario = parse(TEXANS, SCENARIOS / "texans.toml")
     found = responses_of(scenario)
