@@ -69,14 +69,16 @@ def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]
     >>> sum(feedback_of_polynomials([2], [1, 3])).tolist()
     [[-5.0]]
     """
-    from scipy.signal import tf2ss
-
     above, below = _polynomial("num", num), _polynomial("den", den)
     if above.size >= below.size:
         raise BadModelError(
             f"num has degree {above.size - 1} and den {below.size - 1}; more poles than zeros are wanted"
         )
-    return feedback_of_matrices(*tf2ss(above, below))
+    # controllable canonical form. scipy.signal.tf2ss drops coefficients of num below 1e-14 den[0]
+    n = below.size - 1
+    A, B, C = np.eye(n, k=-1), np.zeros((n, 1)), np.zeros((1, n))
+    A[:1], B[:1], C[0, n - above.size :] = -below[1:] / below[0], 1.0, above / below[0]
+    return feedback_of_matrices(A, B, C)
 
 
 def _polynomial(name: str, value: Any) -> FloatArray:
