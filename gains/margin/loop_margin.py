@@ -94,6 +94,8 @@ class LoopAtGivenDelays:
 
     rightmost_root: complex
     unstable_roots_at_zero_delay: int
+    roots_fixed_at_zero: int = 0
+    """The number of roots that stay at 0 whatever the delays; they are left out of everything else."""
 
     @property
     def is_stable(self) -> bool:
@@ -134,9 +136,11 @@ def as_known(value: float, error: float) -> str:
 def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
     from gains.delay.rightmost import rightmost_root
 
-    root = rightmost_root([(term.matrix, term.fixed_s) for term in model.terms])
-    total = sum((term.matrix for term in model.terms), np.zeros_like(model.terms[0].matrix))
-    return LoopAtGivenDelays(root, int(np.count_nonzero(np.linalg.eigvals(total).real > 0.0)))
+    # rounding would move a root at 0 to either side
+    moving, fixed = without_equilibria(*(term.matrix for term in model.terms))
+    root = rightmost_root([(A, term.fixed_s) for A, term in zip(moving, model.terms, strict=True)])
+    unstable = int(np.count_nonzero(np.linalg.eigvals(np.sum(moving, axis=0)).real > 0.0))
+    return LoopAtGivenDelays(root, unstable, fixed)
 
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
@@ -156,7 +160,7 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     checked_by, margin_error_s = second_opinions(analysis, terms)
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
-    notes = _fixed_note(fixed, "0 at every delay")
+    notes = fixed_note(fixed, "0 at every delay")
     if not fixed and not analysis.stable_intervals_s:
         blocks = distinct_blocks(*(term.matrix for term in terms))
         if any(is_singular_for_any_delay(balanced(*block.matrices)) for block in blocks):
@@ -200,7 +204,7 @@ def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysi
     return terms, combined_analysis(found, None), taken_out
 
 
-def _fixed_note(fixed: int, where: str) -> tuple[str, ...]:
+def fixed_note(fixed: int, where: str) -> tuple[str, ...]:
     """Note on the roots that are left out; empty if there are none."""
     stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
     why = "an equilibrium, such as the common value of a consensus"
@@ -261,7 +265,7 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_period,
         roots_fixed_at_zero=fixed,
         complete_to_s=analysis.complete_to_s,
-        notes=("the unknown is the sampling period: u = K x, sampled and held", *_fixed_note(fixed, "z = 1")),
+        notes=("the unknown is the sampling period: u = K x, sampled and held", *fixed_note(fixed, "z = 1")),
     )
 
 
@@ -308,7 +312,7 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
         roots_fixed_at_zero=fixed,
         complete_to_s=margin_s,
         checked_by=checks,
-        notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}", *_fixed_note(fixed, "z = 1")),
+        notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}", *fixed_note(fixed, "z = 1")),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from gains.core.errors import BadModelError
-from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
+from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, fixed_note, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
 from scenarios.errors import did_you_mean
 from scenarios.shipped import names
@@ -138,6 +138,7 @@ def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dic
             "stable": found.is_stable,
             "rightmost_root": [found.rightmost_root.real, found.rightmost_root.imag],
             "unstable_roots_at_zero_delay": found.unstable_roots_at_zero_delay,
+            "roots_fixed_at_zero": found.roots_fixed_at_zero,
             "crossings": [],
         }
     crossings = [{name: known for name, known in vars(c).items() if known is not None} for c in found.crossings]
@@ -152,6 +153,8 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
     if isinstance(found, LoopAtGivenDelays):
         root, verdict = found.rightmost_root, "stable" if found.is_stable else "not stable"
         console.print(f"{verdict}: rightmost root {root.real:.6g} +- {root.imag:.6g}j 1/s")
+        for note in fixed_note(found.roots_fixed_at_zero, "0 at every delay"):
+            console.print(note)
         return
     by, margin = "", found.margin if isinstance(found, ScenarioMargin) else found
     if isinstance(found, ScenarioMargin):  # first the loop as flown, then its model
