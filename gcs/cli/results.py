@@ -210,7 +210,7 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
     columns: dict[str, Callable[[tuple[str, list[str]]], str]] = {"": lambda row: row[0]}
     columns |= {route.method: lambda row, k=k: row[1][k] for k, route in enumerate(routes)}
     title = f"{scenario.name}: designed for its requirement, flown over its links"
-    console.print(table_of(rows(routes), columns, title=title))
+    console.print(table_of(rows(scenario, routes), columns, title=title))
     for route in routes:
         if route.failed:
             console.print(f"{route.method}: {route.failed}")

@@ -50,7 +50,8 @@ class Route:
     overshoot: float | None = None
     """Largest spacing error opposite to its initial direction, as a share of the initial error, over all vehicles."""
     effort_m2_s3: float | None = None
-    """Integral of the squared commands of all vehicles over the flight."""
+    """Integral of the squared commands of all vehicles over the flight. With the loop on board, this and the next are
+    None: the station sends only a part of each command."""
     command_max_m_s2: float | None = None
     spacing_error_max_m: float | None = None
     alpha: float | None = None
@@ -103,6 +104,7 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
     model, K = plan.model, plan.gain
     squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
+    is_whole = scenario.control.loop == "ground"
     pairs = permutations(range(model.vehicles), 2)
     used = [K[model.input_slice(i), model.output_slice(j)].any(axis=0) for i, j in pairs]
     route = Route(
@@ -111,8 +113,8 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
         verdict=summary.verdict,
         settling_time_s=summary.settling_time_s,
         overshoot=_overshoot(plan, flown),
-        effort_m2_s3=float(squared.sum() / scenario.rates.control_hz),
-        command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))),
+        effort_m2_s3=float(squared.sum() / scenario.rates.control_hz) if is_whole else None,
+        command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))) if is_whole else None,
         spacing_error_max_m=summary.spacing_error_max_m,
         alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
         delay_margin_s=summary.delay_margin_s,
@@ -143,13 +145,13 @@ def write_comparison(
     write_scenario(folder, scenario)
     result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
     (folder / RESULT_FILE).write_text(json_text(result, default=vars), encoding="utf-8")
-    figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
+    figures = {"Spacing errors and commands sent in flight": errors_figure(folder / "flights.png", flights.items())}
     if grown:
         figures["Cost of a design against the number of vehicles"] = sizes_figure(folder / "sizes.png", grown)
     page = rendered(
         "compare.html.j2",
         scenario=scenario,
-        rows=rows(routes),
+        rows=rows(scenario, routes),
         methods=[route.method for route in routes],
         failed=[route for route in routes if route.failed],
         sizes=list(zip(grown, ratios(grown), strict=True)),
@@ -160,12 +162,13 @@ def write_comparison(
     (folder / REPORT_FILE).write_text(page, encoding="utf-8")
 
 
-def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
+def rows(scenario: Scenario, routes: list[Route]) -> list[tuple[str, list[str]]]:
     """The rows of the table: the name of a figure, and its value for each route."""
 
     def margin(route: Route, margin_s: float | None) -> str:
         return "no limit" if margin_s is None and not route.failed else ms_text(margin_s, unit="")
 
+    of = "delay margin" if scenario.control.prediction == "off" else "margin without prediction"
     texts: dict[str, Callable[[Route], str]] = {
         "verdict of the flight": lambda route: route.verdict or UNKNOWN,
         "settling time, s": lambda route: number_text(route.settling_time_s, ".2f"),
@@ -173,8 +176,8 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
         "control effort, m²/s³": lambda route: number_text(route.effort_m2_s3, ".0f"),
         "largest command, m/s²": lambda route: number_text(route.command_max_m_s2, ".1f"),
         "largest spacing error, m": lambda route: number_text(route.spacing_error_max_m, ".1f"),
-        "delay margin, sampled, ms": lambda route: margin(route, route.delay_margin_s),
-        "delay margin, continuous, ms": lambda route: margin(route, route.delay_margin_continuous_s),
+        f"{of}, sampled, ms": lambda route: margin(route, route.delay_margin_s),
+        f"{of}, continuous, ms": lambda route: margin(route, route.delay_margin_continuous_s),
         "alpha of the whole formation": lambda route: number_text(route.alpha, ".4f"),
         "decay without delay, 1/s": lambda route: number_text(route.decay_rate_1_s, ".3f"),
         "string peak": lambda route: number_text(route.string_peak, ".3f"),
@@ -186,12 +189,12 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
 
 
 def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
-    """Draw the largest spacing error and the largest command of all vehicles over time, for each route."""
+    """Draw the largest spacing error and the largest command sent to a vehicle over time, for each route."""
     figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
     for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
         flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]
         time_s, place = np.unique(flown["time_s"], return_inverse=True)
-        error, command = np.zeros(time_s.size), np.zeros(time_s.size)
+        error, command = np.full((2, time_s.size), _FLOOR)
         spacing = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
         np.fmax.at(error, place, spacing)
         np.fmax.at(command, place, np.hypot(flown["command_north_m_s2"], flown["command_east_m_s2"]))
@@ -201,7 +204,7 @@ def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
         plot.set_ylim(bottom=_FLOOR)
         plot.margins(x=0.0)
     above.set(ylabel="largest spacing error [m]")
-    below.set(xlabel="time of flight [s]", ylabel="largest command [m/s²]")
+    below.set(xlabel="time of flight [s]", ylabel="largest command sent [m/s²]")
     above.legend(frameon=False)
     return saved(figure, file)
 

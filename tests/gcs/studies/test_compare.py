@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 
 from gains.formation.model import FormationModel
 from gcs.cli.main import app
-from gcs.studies.compare import METHODS
+from gcs.studies.compare import METHODS, rows
 from gcs.studies.compare_cost import DesignCost, left_out
+from scenarios.files import load
 from tests.support.paths import SCENARIOS
 
 SCENARIO = SCENARIOS / "chain3.toml"
@@ -35,6 +36,27 @@ def test_routes_are_flown_and_shown_side_by_side(tmp_path: Path) -> None:
     assert "data:image/png" in page
     assert "http" not in page
     assert f"{routes['graph-dk']['settling_time_s']:.2f}" in page
+
+
+def test_comparison_claims_no_effort_on_board(tmp_path: Path) -> None:
+    # inclusion gains stream nothing here: an effort of 0 was shown beside the larger ones of other routes
+    file, folder = tmp_path / "onboard.toml", tmp_path / "compared"
+    text = SCENARIO.read_text().replace('loop = "ground"', 'loop = "onboard"')
+    file.write_text(text.replace("duration_s = 30.0", "duration_s = 2.0"))
+    result = CliRunner().invoke(app, ["compare", str(file), "--out", str(folder), "--no-sizes"])
+    assert result.exit_code == 0, result.output
+    for route in json.loads((folder / "compare.json").read_text())["routes"]:
+        assert (route["effort_m2_s3"], route["command_max_m_s2"]) == (None, None)
+
+
+def test_comparison_says_its_margins_are_without_prediction() -> None:
+    off = load(SCENARIO)
+    predicting = off.model_copy(update={"control": off.control.model_copy(update={"prediction": 0.05})})
+    (without, with_) = (
+        [title for title, _ in rows(scenario, []) if "margin" in title] for scenario in (off, predicting)
+    )
+    assert without == ["delay margin, sampled, ms", "delay margin, continuous, ms"]
+    assert with_ == ["margin without prediction, sampled, ms", "margin without prediction, continuous, ms"]
 
 
 def test_sizes_that_were_not_tried_are_named_with_the_reason() -> None:
