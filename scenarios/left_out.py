@@ -6,11 +6,12 @@ remains a complete formation, with gains, margins and figures like any other. Fo
 instead form groups that keep no distance from each other.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from scenarios.errors import ScenarioError
 from scenarios.files import checked
+from scenarios.keys.course import ChangedOffset, FormationChange
 from scenarios.schema import Scenario, Vehicle
 
 OPTION = "--without"
@@ -56,6 +57,30 @@ def _without_one(scenario: Scenario, system_id: int) -> Scenario:
     return scenario.model_copy(
         update={
             "vehicles": tuple(moved(vehicle) for vehicle in scenario.vehicles if vehicle is not gone),
+            "formation_changes": tuple(_changes(scenario, gone, ahead)),
             "links": scenario.links.model_copy(update={"vehicles": own_links}),
         }
     )
+
+
+def _changes(scenario: Scenario, gone: Vehicle, ahead: int) -> Iterator[FormationChange]:
+    """The formation changes without a vehicle whose followers then follow `ahead`.
+
+    The offset of such a follower is the sum of two, and changes if either does.
+    """
+    beside, sign = (ahead, -1.0) if gone.follows is None else (gone.system_id, 1.0)
+    offsets = {vehicle.system_id: vehicle.offset_ne_m or (0.0, 0.0) for vehicle in scenario.vehicles}
+    left = [v for v in scenario.vehicles if v.follows is not None and v.system_id not in (gone.system_id, beside)]
+    for change in scenario.formation_changes:
+        listed = {changed.system_id: changed.offset_ne_m for changed in change.offsets}
+        offsets |= listed
+        changed = list[ChangedOffset]()
+        for vehicle in left:
+            share = sign if vehicle.follows == gone.system_id else 0.0
+            if vehicle.system_id in listed or (share and beside in listed):
+                north_m, east_m = (
+                    own + share * other for own, other in zip(offsets[vehicle.system_id], offsets[beside], strict=True)
+                )
+                changed.append(ChangedOffset(system_id=vehicle.system_id, offset_ne_m=(north_m, east_m)))
+        if changed:
+            yield change.model_copy(update={"offsets": tuple(changed)})
