@@ -20,8 +20,8 @@ OPTION = "--without"
 def without(scenario: Scenario, system_ids: Iterable[int], file: Path) -> Scenario:
     """The scenario without these vehicles; `file` is named in errors.
 
-    Raises ScenarioError for a vehicle that is not in the scenario, if none is left, or if gains are given block by
-    block, because these belong to the whole formation.
+    Raises ScenarioError for a vehicle that is not in the scenario, for a leader flown by somebody else, if none is
+    left, or if gains are given block by block, because these belong to the whole formation.
     """
     for system_id in dict.fromkeys(system_ids):
         known = [vehicle.system_id for vehicle in scenario.vehicles]
@@ -32,6 +32,9 @@ def without(scenario: Scenario, system_ids: Iterable[int], file: Path) -> Scenar
             )
         if scenario.control.blocks:
             raise ScenarioError(file, OPTION, system_id, "all vehicles, with control.blocks: they need every vehicle")
+        if system_id == scenario.external_id:  # the first follower would become the leader that nobody commands
+            wanted = "a vehicle that the station flies, with course.leader external"
+            raise ScenarioError(file, OPTION, system_id, wanted)
         scenario = _without_one(scenario, system_id)
     return checked(scenario, file)
 

@@ -79,6 +79,15 @@ def test_a_vehicle_that_cannot_be_left_out_is_named(gone: list[int], said: str) 
     assert said in str(error.value)
 
 
+def test_a_leader_flown_by_somebody_else_cannot_be_left_out() -> None:
+    # once, its first follower became the leader, and the station sent it no commands
+    scenario = load(located("chain3"))
+    led = scenario.model_copy(update={"course": scenario.course.model_copy(update={"leader": "external"})})
+    with pytest.raises(ScenarioError, match="--without: read 1, wanted a vehicle that the station flies"):
+        without(led, [1], FILE)
+    assert without(led, [2], FILE).external_id == 1
+
+
 def test_given_blocks_need_every_vehicle() -> None:
     scenario = load(located("thesis_gains"))
     with pytest.raises(ScenarioError):
