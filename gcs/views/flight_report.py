@@ -98,6 +98,11 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
         Level(monitor.caution_headroom, "caution", _MODE_COLOURS[Mode.CAUTION]),
         Level(monitor.critical_headroom, "critical", _MODE_COLOURS[Mode.CRITICAL]),
     ]
+    unit, reached, dashed = "1 − loop delay / margin", "the loop delay has reached the margin", "the margin"
+    if scenario.control.prediction != "off":
+        unit = "1 − mismatch / mismatch tolerated"
+        reached = "the mismatch of set-points has reached an end of the window"
+        dashed = "the upper end of the window"
     lowest = float(np.nanmin(headroom, initial=0.0))
     delay_ms = 1e3 * np.where(sent, flown["loop_delay_s"], np.nan)
     margin_ms = 1e3 * np.where(np.isfinite(flown["delay_margin_s"]), flown["delay_margin_s"], np.nan)
@@ -106,7 +111,7 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
         time_s,
         lines(headroom),
         title="headroom over time",
-        unit="1 − loop delay / margin",
+        unit=unit,
         levels=levels,
         least=max(_HEADROOM_LEAST, min(0.0, lowest)),
         most=1.0,
@@ -114,10 +119,9 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
     both_ms = [*lines(delay_ms), *lines(margin_ms, dashed=True)]
     delays = chart(time_s, both_ms, title="loop delay and delay margin over time", unit="ms")
     errors = chart(time_s, lines(error_m), title="spacing errors over time", unit="m")
-    reached = "At 0 the loop delay has reached the margin of the gains that are flown."
-    solid = "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; "
+    solid = f"Solid: each vehicle's loop delay. Dashed: {dashed} of its gains at that time; "
     return [
-        ("Headroom", headrooms, reached),
+        ("Headroom", headrooms, f"At 0 {reached} of the gains that are flown."),
         ("Loop delay and margin", delays, f"{solid}where the monitor takes slower gains, it rises."),
         ("Spacing errors", errors, "Distance of each follower from its place behind the vehicle in front."),
     ]

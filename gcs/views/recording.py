@@ -305,6 +305,8 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
     known = ", ".join(f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None)
     margins = f"; of the fastest gains {known}" if known else ""
     few = len(scenario.vehicles) <= LEGEND_MAX
+    predicts = scenario.control.prediction != "off"
+    headroom = "mismatch / mismatch tolerated" if predicts else "loop delay / margin"
     events = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text has the time, even before 0
         text_log_columns=[TextLogColumn(kind="loglevel"), TextLogColumn(kind="body")],
@@ -323,7 +325,7 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
             rrb.Vertical(
                 plot("Spacing errors [m]", "/spacing/**", legend=few),
                 plot(f"Loop delay, RTT (dim), margin (red{margins}) [ms]", "/delay/**"),
-                plot("Headroom: 1 − loop delay / margin [%]", "/headroom/**"),
+                plot(f"Headroom: 1 − {headroom} [%]", "/headroom/**"),
                 rrb.Tabs(
                     plot("Command north [m/s²]", "/command/north_m_s2"),
                     plot("Command east [m/s²]", "/command/east_m_s2"),

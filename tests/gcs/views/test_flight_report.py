@@ -18,9 +18,12 @@ from tests.support.fleets.flown_run import DESIGN, line, ticks_of, write_run
 CHROMIUM = which("chromium") or which("chromium-browser") or which("google-chrome")
 
 
-def report(folder: Path, vehicles: int) -> str:
+def report(folder: Path, vehicles: int, *, prediction: float | None = None) -> str:
     """The page of a run of five seconds, in the middle of which the first vehicle is CRITICAL for a second."""
     scenario = line(vehicles)
+    if prediction is not None:
+        control = scenario.control.model_copy(update={"prediction": prediction})
+        scenario = scenario.model_copy(update={"control": control})
     ticks = ticks_of(scenario, start_s=-0.2, count=260)
     ticks["commanded"] = ticks["time_s"] >= 0.0
     ticks["mode"][130:180, 0] = Mode.CRITICAL
@@ -37,6 +40,18 @@ def test_report_has_verdict_charts_modes_links_and_events(tmp_path: Path) -> Non
         assert f"<h2>{heading}</h2>" in page
     assert page.count("<svg") == 3
     assert "duration reached" in page
+
+
+def test_headroom_with_prediction_is_not_called_delay_over_margin(tmp_path: Path) -> None:
+    over_margin, mismatch = "1 − loop delay / margin", "1 − mismatch / mismatch tolerated"
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    without, predicted = report(tmp_path / "a", 3), report(tmp_path / "b", 3, prediction=0.05)
+    assert over_margin in without
+    assert mismatch not in without
+    assert mismatch in predicted
+    assert over_margin not in predicted
+    assert "the loop delay could have been" not in predicted
 
 
 def test_modes_are_of_vehicles_that_left_nominal_in_flight(tmp_path: Path) -> None:
