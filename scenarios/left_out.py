@@ -43,7 +43,7 @@ def _without_one(scenario: Scenario, system_id: int) -> Scenario:
     gone = next(vehicle for vehicle in scenario.vehicles if vehicle.system_id == system_id)
     behind = sorted((v for v in scenario.vehicles if v.follows == system_id), key=lambda vehicle: vehicle.system_id)
     ahead, (north_m, east_m) = gone.follows, gone.offset_ne_m or (0.0, 0.0)
-    if gone.follows is None:
+    if ahead is None:
         ahead, (north_m, east_m) = behind[0].system_id, (-x for x in behind[0].offset_ne_m or (0.0, 0.0))
 
     def moved(vehicle: Vehicle) -> Vehicle:
