@@ -58,6 +58,7 @@ INTERNAL_FUNCTIONS = {
     "gains.formation.model.checked_gain",
     "gains.formation.pattern.check_fits",
     "gains.formation.pattern.checked_pattern_gain",
+    "gains.margin.loop_margin.fixed_note",
     "gains.margin.model_file.with_short_zeros",
     "gains.margin.opinions.second_opinions",
     "gains.performance.behaviour.block_margin",
