@@ -442,9 +442,9 @@ class Scenario(Part):
         return self.model_copy(update={"monitor": monitor})
 
     def at_rates(self, *, control_hz: float, telemetry_hz: float) -> Self:
-        """The same scenario at other rates.
+        """The same scenario with other rates of control and telemetry.
 
-        Sensor and loop on board run at the lowest multiples of the control rate that are no slower than their own.
+        Sensor and loop on board run at the lowest multiples of the control rate that are no slower than before.
         """
         rates = self.rates.model_copy(update={"control_hz": control_hz, "telemetry_hz": telemetry_hz})
         if self.control.loop != "onboard":

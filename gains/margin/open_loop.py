@@ -74,7 +74,7 @@ def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]
         raise BadModelError(
             f"num has degree {above.size - 1} and den {below.size - 1}; more poles than zeros are wanted"
         )
-    # controllable canonical form. scipy.signal.tf2ss drops coefficients of num below 1e-14 den[0]
+    # controllable canonical form; scipy.signal.tf2ss takes coefficients of num below 1e-14 of den[0] for zeros
     n = below.size - 1
     A, B, C = np.eye(n, k=-1), np.zeros((n, 1)), np.zeros((1, n))
     A[:1], B[:1], C[0, n - above.size :] = -below[1:] / below[0], 1.0, above / below[0]

@@ -40,7 +40,7 @@ _BOUNDS = np.log([(0.01, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
 """Bounds of lag, velocity gain, dead time and natural frequency, as logarithms."""
 _USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
 _GAIN = 1
-"""Place of the velocity gain among them."""
+"""Index of the velocity gain in `_BOUNDS`."""
 _STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2
 _RESOLUTION = 1e-3
 """Misfits that differ by less than this fraction of the velocity do not distinguish models."""
@@ -111,7 +111,7 @@ class Flown:
     velocity_m_s: FloatArray
     """In the direction of the manoeuvre. Its mean, such as a drift, is ignored."""
     velocity_commanded: bool = True
-    """Whether set-points carry a velocity, too; without one, nothing follows it and the velocity gain is 0."""
+    """Whether set-points carry a velocity as well as an acceleration. If not, the velocity gain is 0."""
 
     @property
     def has_too_few_samples(self) -> bool:

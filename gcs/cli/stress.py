@@ -49,7 +49,10 @@ def stress(
     loss: Annotated[
         str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way; replaces bursts")
     ] = "",
-    rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
+    rate: Annotated[
+        str,
+        typer.Option(metavar=_AXIS, help="control rate in Hz; gains stay as designed, a loop on board gets no slower"),
+    ] = "",
     prediction: Annotated[
         str,
         typer.Option(metavar="S,S", help="with two axes: one map for each assumed loop delay in s; 0 is off"),

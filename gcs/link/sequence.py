@@ -6,7 +6,7 @@ from scenarios.kernel import Cell, Columns, Record, Records, at_row, kernel
 from scenarios.schema import NS_PER_S
 
 _KEPT = 64
-"""The counter remembers which of this many newest frames arrived: one bit each."""
+"""The number of newest frames of which the counter remembers whether each arrived; a bit each."""
 NEW, LATE, DUPLICATE = 0, 1, 2
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""

@@ -38,7 +38,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
     spacing_gain_s2 = plain(figures.spacing_gain_max_s2)
     delay_s = figures.delay_s or 0.0
     if figures.timing.all_late and figures.is_stable_at_delay != (delay_s < figures.delay_margin_s):
-        # so slow a rate that half a hold as delay misjudges stability
+        # at this slow rate, half a hold as delay misjudges stability
         figures, spacing_gain_s2 = replace(figures, discrete=True), None
     return CriteriaPart(
         at_delay_s=delay_s,

@@ -329,8 +329,8 @@ def _found(
     continuous_s = block.window_continuous_s()[end] if is_modelled(study.plan) else None
     seed, link_s = study.plan.scenario.seed, zero.varied - waiting_s
     at_onset = slowed.at(round(link_s, 6))
-    slowed_links = at_coordinates(study.plan.scenario, at_onset)
-    if len({slowed_links.link_of(own) for own in block.system_ids}) > 1:  # the margin depends on the delays of all
+    at_links = at_coordinates(study.plan.scenario, at_onset)
+    if len({at_links.link_of(own) for own in block.system_ids}) > 1:  # the margin depends on the delays of all
         predicted_s, continuous_s = (
             _zero_of(near, name, way) for name in ("predicted_growth_1_s", "predicted_growth_continuous_1_s")
         )

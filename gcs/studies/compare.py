@@ -50,8 +50,8 @@ class Route:
     overshoot: float | None = None
     """Largest spacing error opposite to its initial direction, as a share of the initial error, over all vehicles."""
     effort_m2_s3: float | None = None
-    """Integral of the squared commands of all vehicles over the flight. With the loop on board, this and the next are
-    None: the station sends only a part of each command."""
+    """Integral of the squared commands of all vehicles over the flight. None with the loop on board, as is the largest
+    command: the station sends only a part of each command."""
     command_max_m_s2: float | None = None
     spacing_error_max_m: float | None = None
     alpha: float | None = None
@@ -104,7 +104,7 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
     model, K = plan.model, plan.gain
     squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
-    is_whole = scenario.control.loop == "ground"
+    sends_all = plan.onboard is None
     pairs = permutations(range(model.vehicles), 2)
     used = [K[model.input_slice(i), model.output_slice(j)].any(axis=0) for i, j in pairs]
     route = Route(
@@ -113,8 +113,8 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
         verdict=summary.verdict,
         settling_time_s=summary.settling_time_s,
         overshoot=_overshoot(plan, flown),
-        effort_m2_s3=float(squared.sum() / scenario.rates.control_hz) if is_whole else None,
-        command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))) if is_whole else None,
+        effort_m2_s3=float(squared.sum() / scenario.rates.control_hz) if sends_all else None,
+        command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))) if sends_all else None,
         spacing_error_max_m=summary.spacing_error_max_m,
         alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
         delay_margin_s=summary.delay_margin_s,
@@ -168,7 +168,7 @@ def rows(scenario: Scenario, routes: list[Route]) -> list[tuple[str, list[str]]]
     def margin(route: Route, margin_s: float | None) -> str:
         return "no limit" if margin_s is None and not route.failed else ms_text(margin_s, unit="")
 
-    of = "delay margin" if scenario.control.prediction == "off" else "margin without prediction"
+    name = "delay margin" if scenario.control.prediction == "off" else "margin without prediction"
     texts: dict[str, Callable[[Route], str]] = {
         "verdict of the flight": lambda route: route.verdict or UNKNOWN,
         "settling time, s": lambda route: number_text(route.settling_time_s, ".2f"),
@@ -176,8 +176,8 @@ def rows(scenario: Scenario, routes: list[Route]) -> list[tuple[str, list[str]]]
         "control effort, m²/s³": lambda route: number_text(route.effort_m2_s3, ".0f"),
         "largest command, m/s²": lambda route: number_text(route.command_max_m_s2, ".1f"),
         "largest spacing error, m": lambda route: number_text(route.spacing_error_max_m, ".1f"),
-        f"{of}, sampled, ms": lambda route: margin(route, route.delay_margin_s),
-        f"{of}, continuous, ms": lambda route: margin(route, route.delay_margin_continuous_s),
+        f"{name}, sampled, ms": lambda route: margin(route, route.delay_margin_s),
+        f"{name}, continuous, ms": lambda route: margin(route, route.delay_margin_continuous_s),
         "alpha of the whole formation": lambda route: number_text(route.alpha, ".4f"),
         "decay without delay, 1/s": lambda route: number_text(route.decay_rate_1_s, ".3f"),
         "string peak": lambda route: number_text(route.string_peak, ".3f"),

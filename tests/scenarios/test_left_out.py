@@ -46,7 +46,7 @@ def test_the_others_keep_their_places_whoever_is_left_out(name: str) -> None:
 
 @pytest.mark.parametrize("gone", [[1], [2], [3], [4], [1, 3], [2, 4], [5, 1]])
 def test_formation_changes_keep_their_places_whoever_is_left_out(gone: list[int]) -> None:
-    # once, patrol was refused with every vehicle of a change, and a follower of one left out went to a wrong place
+    # a follower takes over the offset of the vehicle that is left out, which may be the one that changes
     changes = load(located("patrol")).formation_changes
     only_3 = changes[0].model_copy(update={"offsets": changes[0].offsets[1:2]})
     for some_change in (changes, (only_3,)):
@@ -80,7 +80,7 @@ def test_a_vehicle_that_cannot_be_left_out_is_named(gone: list[int], said: str) 
 
 
 def test_a_leader_flown_by_somebody_else_cannot_be_left_out() -> None:
-    # once, its first follower became the leader, and the station sent it no commands
+    # its first follower would become a leader that the station commands nothing
     scenario = load(located("chain3"))
     led = scenario.model_copy(update={"course": scenario.course.model_copy(update={"leader": "external"})})
     with pytest.raises(ScenarioError, match="--without: read 1, wanted a vehicle that the station flies"):

@@ -33,7 +33,7 @@ def test_margin_is_phase_margin_over_crossover_frequency() -> None:
 
 
 def test_small_coefficients_of_a_numerator_count(recwarn: pytest.WarningsRecorder) -> None:
-    # (s + 1) / (1e15 s^2 + s) crosses over at 1e-7.5 rad/s with a phase margin of two times that: 2 s, once 1 s
+    # (s + 1) / (1e15 s^2 + s) crosses over at 1e-7.5 rad/s with a phase margin of two times that, so 2 s
     assert delay_margin(*delayed_feedback(SimpleNamespace(num=[1.0, 1.0], den=[1e15, 1.0, 0.0]))) == pytest.approx(2.0)
     delayed_feedback(SimpleNamespace(num=[0.0], den=[1.0, 1.0]))
     assert not recwarn.list

@@ -216,7 +216,7 @@ def test_multiples_without_a_common_divisor_are_refused() -> None:
 
 
 def test_given_delays_leave_out_the_common_value_of_a_consensus() -> None:
-    # eigenvalue 2 of the Laplacian, late by 0.1 s: s = -2 e^(-0.1 s); its 0 was a rounded number of either sign
+    # eigenvalue 2 of the Laplacian, late by 0.1 s: s = -2 e^(-0.1 s). The eigenvalue 0 is rounded to either sign
     result = result_of({"terms": [{"A": [[-1, 1], [1, -1]], "delay": 0.1}]})
     root = result["rightmost_root"][0]
     assert (result["roots_fixed_at_zero"], result["unstable_roots_at_zero_delay"], result["stable"]) == (1, 0, True)

@@ -39,7 +39,7 @@ def test_routes_are_flown_and_shown_side_by_side(tmp_path: Path) -> None:
 
 
 def test_comparison_claims_no_effort_on_board(tmp_path: Path) -> None:
-    # inclusion gains stream nothing here: an effort of 0 was shown beside the larger ones of other routes
+    # inclusion gains stream nothing here, so the effort sent would be 0
     file, folder = tmp_path / "onboard.toml", tmp_path / "compared"
     text = SCENARIO.read_text().replace('loop = "ground"', 'loop = "onboard"')
     file.write_text(text.replace("duration_s = 30.0", "duration_s = 2.0"))

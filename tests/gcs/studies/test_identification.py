@@ -50,7 +50,7 @@ def test_a_known_lag_is_found_again(tmp_path: Path) -> None:
 
 
 def test_no_velocity_gain_is_found_where_none_is_accepted(tmp_path: Path) -> None:
-    # once, a vehicle that responds at once was given 10 1/s, which every other command refused
+    # a vehicle that responds at once; with a velocity gain, other commands refuse the response
     (tmp_path / "at_once.py").write_text(
         "import numpy as np\n\ndef step(state, command, dt_s, memory):\n"
         "    moved = dt_s * state[2:] + dt_s**2 / 2 * command\n"
