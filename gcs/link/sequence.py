@@ -5,8 +5,8 @@ import numpy as np
 from scenarios.kernel import Cell, Columns, Record, Records, at_row, kernel
 from scenarios.schema import NS_PER_S
 
-_KEPT = 64
-"""The number of newest frames of which the counter remembers whether each arrived; a bit each."""
+_KEPT = 128
+"""How far back the counter remembers which frames arrived. Farther back, a replayed frame would be used again."""
 NEW, LATE, DUPLICATE = 0, 1, 2
 _STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
@@ -30,7 +30,7 @@ COUNTER = np.dtype(
         ("received", "i8"), ("lost", "i8"), ("late", "i8"), ("duplicate", "i8"),
         ("last", "i8"),  # sequence number of the last frame
         ("newest", "i8"), ("newest_ns", "i8"),  # newest frame: its number, wraps undone (-1: none yet), and its time
-        ("seen", "u8"),  # bit k is set if frame newest - k has arrived
+        ("seen", "u8"), ("seen_before", "u8"),  # bit k is set if frame newest - k, or newest - 64 - k, has arrived
         ("run", "i8"),  # late frames in a row, each a little newer than the last
         ("lag", "f8"),  # by how many numbers frames have recently been overtaken
         ("rate_hz", "f8"), ("rate_count", "i8"), ("rate_ns", "i8"), ("steady_frames", "f8"), ("steady_ns", "f8"),
@@ -65,18 +65,24 @@ def count(counter: Record, sequence: int, time_ns: int) -> int:
     counter.lag = max(counter.lag * (1.0 - _FORGET), float(-ahead))
     if ahead > 0:
         counter.lost = min(counter.lost + ahead - 1, _MOST)
-        counter.newest += ahead
-        counter.seen = (counter.seen << np.uint64(ahead) if ahead < _KEPT else np.uint64(0)) | np.uint64(1)
+        _see_next(counter, ahead)
         _note_rate(counter, time_ns)
         counter.newest_ns = time_ns
         return NEW
-    bit = np.uint64(1) << np.uint64(-ahead) if -ahead < _KEPT else np.uint64(0)
-    if counter.seen & bit:
+    back = -ahead
+    seen, place = counter.seen, back
+    if back >= 64:
+        seen, place = counter.seen_before, back - 64
+    bit = np.uint64(1) << np.uint64(place) if back < _KEPT else np.uint64(0)
+    if seen & bit:
         counter.duplicate += 1
         return DUPLICATE
     counter.late += 1
     counter.lost = max(0, counter.lost - 1)
-    counter.seen |= bit
+    if back >= 64:
+        counter.seen_before |= bit
+    else:
+        counter.seen |= bit
     return LATE
 
 
@@ -85,8 +91,24 @@ def restart(counter: Record) -> None:
     """Treat the next frame as the first: the sender has restarted."""
     counter.newest = -1
     counter.newest_ns = counter.rate_ns = counter.rate_count = counter.run = counter.last = 0
-    counter.seen = 0
+    counter.seen = counter.seen_before = 0
     counter.rate_hz = counter.lag = counter.steady_frames = counter.steady_ns = 0.0
+
+
+@kernel
+def _see_next(counter: Record, ahead: int) -> None:
+    """Record the arrival of the frame that is `ahead` numbers newer than the newest."""
+    counter.newest += ahead
+    if ahead >= _KEPT:
+        counter.seen = counter.seen_before = 0
+    elif ahead >= 64:
+        counter.seen_before = counter.seen << np.uint64(ahead - 64)
+        counter.seen = 0
+    else:
+        carried = counter.seen >> np.uint64(64 - ahead)
+        counter.seen_before = counter.seen_before << np.uint64(ahead) | carried
+        counter.seen = counter.seen << np.uint64(ahead)
+    counter.seen |= np.uint64(1)
 
 
 @kernel
@@ -119,7 +141,7 @@ class SequenceCounter:
     A sequence number holds 8 bits of the count; time gives the rest. A frame can be only slightly newer than the frame
     rate suggests; one that seems newer than that is an old one. So a swapped pair is one late frame, not 254 lost ones,
     and all losses of a minute's outage are counted. A frame overtaken by more than 223 others is miscounted. A late
-    frame is no longer counted as lost once it arrives. A copy that arrives after 64 newer frames counts as late.
+    frame is no longer counted as lost once it arrives.
     """
 
     received = Cell[int]()

@@ -39,9 +39,10 @@ def test_duplicates_are_counted_apart() -> None:
     assert counts(counted([0, 1, 1, 2, 0, 3])) == (6, 0, 0, 2)
 
 
-@pytest.mark.parametrize(("newer", "late", "duplicate"), [(63, 0, 1), (64, 1, 0)])
-def test_copies_are_recognised_among_the_newest_sixty_four_frames(newer: int, late: int, duplicate: int) -> None:
-    assert counts(counted([*range(newer + 1), 0])) == (newer + 2, 0, late, duplicate)
+@pytest.mark.parametrize("newer", [63, 64, 127])
+def test_copies_are_recognised_among_the_newest_128_frames(newer: int) -> None:
+    """A replayed frame that counted as late would be used again."""
+    assert counts(counted([*range(newer + 1), 0])) == (newer + 2, 0, 0, 1)
 
 
 def test_a_clock_that_jumps_by_centuries_fills_the_count() -> None:
