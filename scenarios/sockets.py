@@ -20,7 +20,8 @@ from scenarios.kernel import int64, kernel
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
-_LONGEST_DATAGRAM = 2048
+_LONGEST_DATAGRAM, _LONGEST_SHARED = 2048, 1400
+"""The longest datagram that is read, and the longest that frames share: networks carry it in one piece."""
 MOST_DATAGRAMS, _MOST_BYTES = 4096, 1 << 20
 """Limits of one read; the rest waits in the sockets."""
 NO_ADDRESS = -1
@@ -33,6 +34,9 @@ _NAME, _VECTOR, _CONTROL, _CLOCK, _EMPTIED, OFFSET, _WORDS = 7, 9, 11, 19, 21, 2
 """Where the parts of the array begin, and its length. The last two words are the time at which all sockets were last
 empty and, from the last read, the offset from the monotonic clock to ns since 1970."""
 _NAME_BYTES, _CONTROL_BYTES, _STAMP = 16, 64, 13
+_VERSION_1, _VERSION_2, _OVERHEAD_1, _OVERHEAD_2, _SIGNATURE = 0xFE, 0xFD, 8, 12, 13
+"""The first byte of a MAVLink frame, and how many bytes it has besides its payload."""
+_MOST_FRAMES = _LONGEST_DATAGRAM // _OVERHEAD_1
 _48_BITS, _LONGEST_NS = 0xFFFFFFFFFFFF, 2**63 - 1
 
 
@@ -99,14 +103,23 @@ class Buffers(NamedTuple):
     stream: Bytes
     table: Ints
     words: Ints
+    together: Bytes
+    """Room for the frames that share a datagram; empty if each travels alone."""
 
 
 class Reader:
-    """Reads sockets that are `stamped`, at most `most_of_each` datagrams from each at once."""
+    """Reads sockets that are `stamped`, at most `most_of_each` datagrams from each at once.
 
-    def __init__(self, most_of_each: int = MOST_DATAGRAMS) -> None:
+    With `together`, MAVLink frames share datagrams: `write` sends consecutive frames to one address in one datagram,
+    and frames that came in one datagram are read as if each had come in its own.
+    """
+
+    def __init__(self, most_of_each: int = MOST_DATAGRAMS, *, together: bool = False) -> None:
         self._most = most_of_each
-        self.buffers = Buffers(np.empty(_MOST_BYTES, np.uint8), np.empty((5, MOST_DATAGRAMS), np.int64), _words())
+        self.buffers = Buffers(
+            np.empty(_MOST_BYTES, np.uint8), np.empty((5, MOST_DATAGRAMS), np.int64), _words(),
+            np.empty(_LONGEST_SHARED if together else 0, np.uint8),
+        )  # fmt: skip
         self.buffers.words[_EMPTIED] = time.monotonic_ns()
 
     def read(self, descriptors: Sequence[int] | Ints) -> Batch:
@@ -119,13 +132,15 @@ def batch(buffers: Buffers, count: int, end: int, errors: int, read_ns: int) -> 
     return Batch(buffers.stream[:end].copy(), buffers.table[:, :count].copy(), read_ns, errors)
 
 
-def write(stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints) -> tuple[Ints, int, int]:
+def write(
+    stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, buffers: Buffers
+) -> tuple[Ints, int, int]:
     """Send datagrams in order, from these sockets to the addresses with these numbers, or to their peers.
 
     Returns when each was handed to the operating system, how many met a closed port, and how many failed otherwise.
     """
     sent_ns = np.empty(len(begins), np.int64)
-    return sent_ns, *_write(stream, begins, ends, descriptors, addresses, sent_ns, _words())
+    return sent_ns, *write_all(stream, begins, ends, descriptors, addresses, sent_ns, buffers)
 
 
 def realtime_offset_ns() -> int:
@@ -183,7 +198,7 @@ def read_all(descriptors: Ints, most: int, buffers: Buffers) -> tuple[int, int, 
     """Read at most `most` datagrams from each socket; returns the last arguments of `batch`."""
     words = buffers.words
     begin_ns, words[OFFSET] = monotonic_ns(words), _offset_ns(words)
-    count, end, errors, empty = _read(descriptors, most, buffers.stream, buffers.table, words)
+    count, end, errors, empty = _read(descriptors, most, buffers)
     read_ns = monotonic_ns(words)
     _to_monotonic(buffers.table, count, -words[OFFSET], words[_EMPTIED], read_ns)
     if empty:
@@ -192,15 +207,16 @@ def read_all(descriptors: Ints, most: int, buffers: Buffers) -> tuple[int, int, 
 
 
 @kernel
-def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints) -> tuple[int, int, int, bool]:
+def _read(descriptors: Ints, most: int, buffers: Buffers) -> tuple[int, int, int, bool]:
     """Read sockets; returns the numbers of datagrams, bytes and errors, and whether all sockets are empty."""
-    base = words.ctypes.data
+    stream, table, words, together = buffers
+    base, room = words.ctypes.data, table.shape[1] - (_MOST_FRAMES if len(together) else 1)
     count = end = errors = 0
     empty = True
     for descriptor in descriptors:
         emptied = False
         for _ in range(most):
-            if count == table.shape[1] or end + _LONGEST_DATAGRAM > len(stream):
+            if count > room or end + _LONGEST_DATAGRAM > len(stream):
                 return count, end, errors, False
             words[0], words[1], words[2], words[3] = base + 8 * _NAME, _NAME_BYTES, base + 8 * _VECTOR, 1
             words[4], words[5] = base + 8 * _CONTROL, _CONTROL_BYTES
@@ -208,9 +224,12 @@ def _read(descriptors: Ints, most: int, stream: Bytes, table: Ints, words: Ints)
             size = _recvmsg(descriptor, base, _DONTWAIT)
             if size >= 0:
                 stamp_ns = words[_STAMP] * NS_PER_S + words[_STAMP + 1] if words[5] > 0 else 0
-                table[0, count], table[1, count], table[2, count] = end, end + size, words[_NAME] >> 16 & _48_BITS
-                table[3, count], table[4, count] = stamp_ns, descriptor
-                count, end = count + 1, end + size
+                frames = _frames(stream, end, end + size) if len(together) else 1
+                for _ in range(frames):
+                    part = size if frames == 1 else _frame_bytes(stream, end, len(stream))
+                    table[0, count], table[1, count], table[2, count] = end, end + part, words[_NAME] >> 16 & _48_BITS
+                    table[3, count], table[4, count] = stamp_ns, descriptor
+                    count, end = count + 1, end + part
             elif _errno()[0] == _EAGAIN:
                 emptied = True
                 break
@@ -232,23 +251,65 @@ def _to_monotonic(table: Ints, count: int, offset_ns: int, emptied_ns: int, read
 
 
 @kernel
-def _write(
-    stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, sent_ns: Ints, words: Ints
+def _frame_bytes(stream: Bytes, begin: int, end: int) -> int:
+    """The size of the MAVLink frame that begins here; 0 if none does, or if it is incomplete."""
+    if end - begin < 3:
+        return 0
+    size = 0
+    if stream[begin] == _VERSION_2:
+        size = _OVERHEAD_2 + int64(stream[begin + 1]) + _SIGNATURE * int64(stream[begin + 2] & 1)
+    elif stream[begin] == _VERSION_1:
+        size = _OVERHEAD_1 + int64(stream[begin + 1])
+    return size if begin + size <= end else 0
+
+
+@kernel
+def _frames(stream: Bytes, begin: int, end: int) -> int:
+    """How many frames fill a datagram without a gap; 1 if it holds anything else."""
+    frames, place = 0, begin
+    while place < end:
+        size = _frame_bytes(stream, place, end)
+        if not size:
+            return 1
+        frames, place = frames + 1, place + size
+    return max(1, frames)
+
+
+@kernel
+def write_all(
+    stream: Bytes, begins: Ints, ends: Ints, descriptors: Ints, addresses: Ints, sent_ns: Ints, buffers: Buffers
 ) -> tuple[int, int]:
-    """Send datagrams; returns how many met a closed port, and how many failed otherwise."""
-    refused = failed = 0
-    for k in range(len(begins)):
-        place = stream.ctypes.data + begins[k]
-        sent_ns[k], error = send(place, ends[k] - begins[k], descriptors[k], addresses[k], words)
+    """As `write`; the times are put into `sent_ns`."""
+    refused = failed = first = 0
+    while first < len(begins):
+        place, size, stop = stream.ctypes.data + begins[first], ends[first] - begins[first], first + 1
+        while (
+            stop < len(begins)
+            and descriptors[stop] == descriptors[first]
+            and addresses[stop] == addresses[first]
+            and size + ends[stop] - begins[stop] <= len(buffers.together)
+        ):
+            size += ends[stop] - begins[stop]
+            stop += 1
+        if stop > first + 1:
+            place, size = buffers.together.ctypes.data, 0
+            for k in range(first, stop):
+                for byte in range(begins[k], ends[k]):
+                    buffers.together[size] = stream[byte]
+                    size += 1
+        time_ns, error = _send(place, size, descriptors[first], addresses[first], buffers.words)
+        for k in range(first, stop):
+            sent_ns[k] = time_ns
         if error == _REFUSED:
             refused += 1
         elif error:
             failed += 1
+        first = stop
     return refused, failed
 
 
 @kernel
-def send(place: int, size: int, descriptor: int, address: int, words: Ints) -> tuple[int, int]:
+def _send(place: int, size: int, descriptor: int, address: int, words: Ints) -> tuple[int, int]:
     """Send the bytes at a place in memory to the address with this number, or to the socket's peer.
 
     Returns when they were handed to the operating system, and its error number, or 0.

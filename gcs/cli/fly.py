@@ -104,6 +104,7 @@ def fly(
                     *at,
                     options.opened_guard(key, role="station"),
                     networks_of(vehicle.system_id for vehicle in scenario.vehicles),
+                    together=scenario.links.one_port,
                 )
             )
             options.warn_if_open(link)

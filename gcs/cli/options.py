@@ -238,7 +238,14 @@ def address(option: str, text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def listening(option: str, text: str, guard: "Guard | None" = None, networks: Sequence[int] = (0,)) -> "StationSocket":
+def listening(
+    option: str,
+    text: str,
+    guard: "Guard | None" = None,
+    networks: Sequence[int] = (0,),
+    *,
+    together: bool = False,
+) -> "StationSocket":
     """Open the socket that listens to the networks at the HOST:PORT given to an option (see `StationSocket`)."""
     from gcs.drive.udp import StationSocket
 
@@ -246,7 +253,7 @@ def listening(option: str, text: str, guard: "Guard | None" = None, networks: Se
     every = ", ".join(map(str, networks))
     ports = "a free UDP port" if every == "0" else f"free UDP ports, the one given plus {every}"
     with usable(f"{option}: {text}", f"{ports} of this machine"):
-        return StationSocket(host, port, guard, networks)
+        return StationSocket(host, port, guard, networks, together=together)
 
 
 def warn_if_open(link: "StationSocket") -> None:

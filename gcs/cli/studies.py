@@ -89,6 +89,9 @@ def bench(
         bool,
         typer.Option("--real-time", help="fly once over UDP; show punctuality and the errors of measured latencies"),
     ] = False,
+    one_port: Annotated[
+        bool, typer.Option("--one-port", help="with --real-time: set links.one_port, so that frames share datagrams")
+    ] = False,
     signed: Annotated[bool, typer.Option("--signed", help="also measure the cost of signing")] = False,
     peers: Annotated[
         bool, typer.Option("--peers", help="do the same work with other people's tools and print ratios")
@@ -123,9 +126,13 @@ def bench(
     if len(given) > 1:
         raise InputError(f"read {' and '.join(given)}, wanted one of them")
     options.refuse_alone("--workers", workers or None, "--cluster", cluster or None)
+    options.refuse_alone("--one-port", one_port or None, "--real-time", real_time or None)
     scenario = options.load_scenario(scenario_file, allow_code=allow_code)
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
+    if one_port:
+        links = scenario.links.model_copy(update={"one_port": True})
+        scenario = scenario.model_copy(update={"links": links})
     options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     if peers:
         from gcs.studies.peers import SIZES, side_by_side

@@ -103,7 +103,7 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
     try:
         before = _processor_times()
         networks = networks_of(plan.formation.system_ids)
-        with StationSocket("127.0.0.1", 0, networks=networks) as link:
+        with StationSocket("127.0.0.1", 0, networks=networks, together=plan.scenario.links.one_port) as link:
             summary = fly(plan, design, link, folder, show_table=False)
         needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
         if lost := [text for text in summary.not_logged if text.startswith(needed)]:

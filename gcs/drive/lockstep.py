@@ -124,6 +124,7 @@ def prepare(plan: FlightPlan) -> None:
     if station.has_fast_path:
         UdpFastPath(station, no_wire(), lambda _network, _entries: None).step()
     station.vehicles[0].frames.restart()  # as after a long silence
+    station.vehicles[0].send_timesync(0, 0, Outbox())  # as in answer to a datagram of several frames
     station.vehicles[0].delivery_ns(0, 0)  # as when it reports how long it holds set-points
 
 

@@ -48,12 +48,21 @@ class StationSocket:
     """A bound UDP socket for each network, with kernel receive stamps; with a guard, frames are signed and verified.
 
     `port` is that of network 0, even if that network has no vehicles; network k listens at `port` + k. With port 0,
-    free ports are found. Raises OSError if an address cannot be bound.
+    free ports are found. With `together`, frames share datagrams, see `Reader`. Raises OSError if an address cannot be
+    bound.
     """
 
-    def __init__(self, host: str, port: int, guard: Guard | None = None, networks: Sequence[int] = (0,)) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        guard: Guard | None = None,
+        networks: Sequence[int] = (0,),
+        *,
+        together: bool = False,
+    ) -> None:
         self.guard, self.networks = guard, networks
-        self._reader = Reader()
+        self._reader = Reader(together=together)
         self._reader.read([])  # compiles it before the flight
         self._sockets = _bound(host, port, networks)
         descriptors = np.zeros(LAST_NETWORK + 1, np.int64)
@@ -125,7 +134,9 @@ class StationSocket:
             (stream, table) if self.guard is None else Outbox(self.guard.sent(outbox, clock_ns())).packed()
         )
         descriptors = self.wire.descriptors[addresses >> NETWORK_BIT]
-        table[3], refused, failed = write(signed, begins, ends, descriptors, addresses & NUMBER_BITS)
+        table[3], refused, failed = write(
+            signed, begins, ends, descriptors, addresses & NUMBER_BITS, self._reader.buffers
+        )
         self.send_errors += refused + failed  # full buffers and closed ports are losses: links count them
         return Arrivals(stream, table, np.zeros(len(outbox), np.int64))
 

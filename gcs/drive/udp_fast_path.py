@@ -38,7 +38,7 @@ from scenarios.sockets import (
     batch,
     monotonic_ns,
     read_all,
-    send,
+    write_all,
 )
 
 if TYPE_CHECKING:
@@ -192,12 +192,13 @@ def _received(own: Any) -> tuple[Ints, Ints]:
 @array_kernel
 def _send(own: Any, sending: Sending) -> Ints:
     """Send frames to vehicles; returns when each was handed to the operating system."""
-    wire, sent_ns = own.wire, np.empty(len(sending.rows), np.int64)
-    for k in range(len(sending.rows)):
+    wire, count, width = own.wire, len(sending.rows), sending.frames.shape[1]
+    begins, ends, descriptors, addresses, sent_ns = np.empty((5, count), np.int64)
+    for k in range(count):
         address = own.data.tables.links[sending.rows[k]].address
-        place = sending.frames.ctypes.data + k * sending.frames.shape[1]
-        descriptor = wire.descriptors[address >> NETWORK_BIT]
-        sent_ns[k], _ = send(place, sending.sizes[k], descriptor, address & NUMBER_BITS, wire.buffers.words)
+        begins[k], ends[k] = k * width, k * width + sending.sizes[k]
+        descriptors[k], addresses[k] = wire.descriptors[address >> NETWORK_BIT], address & NUMBER_BITS
+    write_all(sending.frames.ravel(), begins, ends, descriptors, addresses, sent_ns, wire.buffers)
     return sent_ns
 
 

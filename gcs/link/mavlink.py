@@ -406,14 +406,19 @@ def same_frames(frame: Array, extra: int, rows: Array, sequences: Array) -> NDAr
     return frames
 
 
-TIMESYNC_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES
+TIMESYNC_FRAME_BYTES = _OVERHEAD + _TIMESYNC_BYTES + 2
+"""The longest TIMESYNC frame: pymavlink's dialect lacks the two last fields, the ids of the target."""
 
 
 @kernel
-def encode_timesync(data: Array, tc1_ns: int, ts1_ns: int, sequence: int) -> int:
-    """Write a TIMESYNC frame (a request if tc1 is 0) into `TIMESYNC_FRAME_BYTES` zeros; returns its length."""
+def encode_timesync(data: Array, tc1_ns: int, ts1_ns: int, target: int, sequence: int) -> int:
+    """Write a TIMESYNC frame into `TIMESYNC_FRAME_BYTES` zeros; returns its length.
+
+    A request has tc1 = 0, a reply mirrors ts1. `target` is the system id of the vehicle, or 0 for all that hear it.
+    """
     _put(data, _HEADER_BYTES, np.uint64(tc1_ns), 8)
     _put(data, _HEADER_BYTES + 8, np.uint64(ts1_ns), 8)
+    data[_HEADER_BYTES + 16] = target
     end = len(data) - 2
     while end > _HEADER_BYTES + 1 and not data[end - 1]:
         end -= 1  # trailing zeros are omitted, except for the first byte of the payload

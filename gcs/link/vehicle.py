@@ -72,6 +72,8 @@ LINK = np.dtype(
         ("orders_reported", "i8"),  # frame-order faults already reported, as bits 1 << LATE and 1 << DUPLICATE
         ("left_out", "?"),  # see `RemoteVehicle`
         ("sequence", "i8"),  # of the last frame sent to it
+        ("first_at_port", "?"),  # heartbeats are sent to it: no vehicle before it in the table sends from its port
+        ("target", "i8"),  # its MAVLink system id if others at its port would answer its TIMESYNC too; else 0
         ("lag_ms", "i8"),  # reported lag after which held set-points act
         ("lag_jumps", "i8"),  # clock jumps counted when it was reported; -1: never reported
         ("local_ms", "i8"),  # time_boot_ms of its newest LOCAL_POSITION_NED
@@ -117,6 +119,14 @@ def new_links(n: int) -> Links:
     return Links(known, new_clocks(n), new_counters(n))
 
 
+def note_ports(known: Records, wire_ids: NDArray[np.int64]) -> None:
+    """Note which vehicles share a port, after the address of one has changed."""
+    _, first, port, sharing = np.unique(known["address"], return_index=True, return_inverse=True, return_counts=True)
+    known["first_at_port"] = False
+    known["first_at_port"][first] = True
+    known["target"] = np.where(sharing[port] > 1, wire_ids, 0)
+
+
 def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key_ms: int) -> Block:
     """Set-points, as of `gcs.link.mavlink.set_point_frames`, to those marked `sent` whose vehicle has been heard."""
     rows = heard(links.known, points["sent"])
@@ -125,8 +135,8 @@ def set_points_to(links: Links, points: Records, targets: NDArray[np.int64], key
 
 
 def heartbeats_to(links: Links) -> Block:
-    """A HEARTBEAT from the station to each vehicle that has been heard."""
-    rows = heard(links.known, np.ones(len(links.to), np.bool_))
+    """A HEARTBEAT from the station to each port from which vehicles have been heard."""
+    rows = heard(links.known, links.known["first_at_port"])
     frames = mavlink.same_frames(HEARTBEAT, mavlink.HEARTBEAT_EXTRA, rows, links.known["sequence"])
     return Block(frames, np.full(len(rows), frames.shape[1]), rows, links.to)
 
@@ -168,7 +178,7 @@ def ask(
         rows[place] = row
         known[row].sequence = (known[row].sequence + 1) & 0xFF
         ts1_ns = request(clocks[row], pending_ns[row], now_ns)
-        sizes[place] = encode_timesync(frames[place], 0, ts1_ns, known[row].sequence)
+        sizes[place] = encode_timesync(frames[place], 0, ts1_ns, known[row].target, known[row].sequence)
         place += 1
     return frames[:place], sizes[:place], rows[:place]
 
@@ -234,6 +244,7 @@ class RemoteVehicle:
     _launched, _heartbeat = Cell[bool](), Cell[int]()
     _local_ms, _local_is_new = Cell[int](), Cell[bool]()
     _orders_reported, _sequence, _lag_ms, _lag_jumps = Cell[int](), Cell[int](), Cell[int](), Cell[int]()
+    _target = Cell[int]()
 
     def __init__(
         self,
@@ -373,6 +384,14 @@ class RemoteVehicle:
         """Queue a frame to the vehicle, if its address is known."""
         if self.address is not None:
             outgoing.append((self.encode(msg_id, fields), self.address))
+
+    def send_timesync(self, tc1_ns: int, ts1_ns: int, outgoing: Outbox) -> None:
+        """Queue a TIMESYNC: a request if tc1 is 0, else the answer to the request with this ts1."""
+        if self.address is not None:
+            frame = np.zeros(TIMESYNC_FRAME_BYTES, np.uint8)
+            self._sequence = (self._sequence + 1) & 0xFF
+            size = encode_timesync(frame, tc1_ns, ts1_ns, self._target, self._sequence)
+            outgoing.append((frame[:size].tobytes(), self.address))
 
     def is_elsewhere(self, address: Address, received_ns: int) -> bool:
         """Whether the vehicle sends from another address and has been heard recently."""

@@ -180,7 +180,7 @@ def fast_step(
     links = tables.links
     if schedule.now_ns >= schedule.next_heartbeat_ns:
         schedule.next_heartbeat_ns = schedule.now_ns + HEARTBEAT_NS
-        to = heard(links, np.ones(len(links), np.bool_))
+        to = heard(links, links.first_at_port)
         frames = same_frames(data.heartbeat, HEARTBEAT_EXTRA, to, links.sequence)
         heartbeats = Sending(frames, np.full(len(to), frames.shape[1]), to)
     if schedule.now_ns >= schedule.next_requests_ns:
@@ -204,7 +204,8 @@ def _answered(tables: Tables, nothing: Sending) -> Sending:
         news = tables.news[place]
         link = tables.links[news.row]
         link.sequence = (link.sequence + 1) & 0xFF
-        sizes[place], rows[place] = encode_timesync(frames[place], news.value_ns, news.sent_ns, link.sequence), news.row
+        frame, rows[place] = frames[place], news.row
+        sizes[place] = encode_timesync(frame, news.value_ns, news.sent_ns, link.target, link.sequence)
     tables.news_count[0] = 0
     return Sending(frames, sizes, rows)
 

@@ -29,7 +29,15 @@ from gcs.link.mavlink import (
     unsigned_at,
 )
 from gcs.link.sequence import DUPLICATE, NEW, count
-from gcs.link.vehicle import FORGET_NUMBERS_NS, MAVLINK_1, RemoteVehicle, Report, delivery_ns, heartbeat_state
+from gcs.link.vehicle import (
+    FORGET_NUMBERS_NS,
+    MAVLINK_1,
+    RemoteVehicle,
+    Report,
+    delivery_ns,
+    heartbeat_state,
+    note_ports,
+)
 from scenarios.kernel import Array, Records, array_kernel, int64, kernel
 from scenarios.networks import LAST_NETWORK, network_of, system_id_of, wire_id
 
@@ -121,6 +129,7 @@ class Reception:
         """Rows of vehicles whose second sender has been reported."""
         self._fresh = np.zeros((n, MOST_PENDING), np.int64), np.zeros(n, np.int64)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(fleet.vehicles)}
+        self._wire_ids = np.array([*map(wire_id, self._row)])
         self.row_of = np.full((LAST_NETWORK + 1, 256), -1)
         for system_id, row in self._row.items():
             self.row_of[network_of(system_id), wire_id(system_id)] = row
@@ -197,6 +206,7 @@ class Reception:
                         self._report("link", "has a second sender, whose frames are refused", vehicle.system_id)
                     continue
                 vehicle.address = datagram.address
+                note_ports(self._fleet.links.known, self._wire_ids)
                 self._report("vehicle", "found", vehicle.system_id)
             vehicle.heard_ns = datagram.received_ns
             vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
@@ -232,8 +242,7 @@ class Reception:
             case mavlink.TIMESYNC:
                 tc1_ns, ts1_ns = fields
                 if tc1_ns == 0:
-                    answer = mavlink.timesync(tc1_ns=received_ns, ts1_ns=ts1_ns)
-                    vehicle.send(mavlink.TIMESYNC, answer, outgoing)
+                    vehicle.send_timesync(received_ns, ts1_ns, outgoing)
                 else:
                     _take_reply(self.tables, row, tc1_ns, ts1_ns, received_ns, now)
                     self._follow_up(outgoing)
@@ -270,9 +279,9 @@ class Reception:
                 vehicle.begin_anew()
                 self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
             elif kind == ANSWER:
-                vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=value_ns, ts1_ns=sent_ns), outgoing)
+                vehicle.send_timesync(value_ns, sent_ns, outgoing)
             else:
-                vehicle.send(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=value_ns), outgoing)
+                vehicle.send_timesync(0, value_ns, outgoing)
 
 
 @kernel

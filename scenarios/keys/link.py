@@ -206,3 +206,7 @@ class Links(Part):
     """Zero of the link time, to which outages and delay points refer. `flight`: when the station's first set-point
     enters a link; before that, the first delay point applies and there is no outage. `start`: when the vehicles
     start."""
+    one_port: bool = False
+    """Whether the vehicles of each network share one UDP port, as behind a radio or a router, instead of having one
+    each. In real time, frames that are due together then travel in one datagram of up to 1400 bytes, and the station
+    sends one heartbeat for all of them. Each frame still has its own fate on its vehicle's link."""

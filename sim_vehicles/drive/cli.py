@@ -102,7 +102,7 @@ def _fly(
     epoch_ns = time.time_ns() - time.monotonic_ns()
     signed = open_links(options.key, system_ids, epoch_ns=epoch_ns) if options.key else None
     try:
-        ports = Ports(system_ids, options.station)
+        ports = Ports(system_ids, options.station, one_port=scenario.links.one_port)
     except OSError as error:
         raise _UsageError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
     opened.callback(ports.sockets.close)

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenarios.sockets import Bytes, Ints, joined
+from scenarios.kernel import array_kernel, int64, kernel
+from scenarios.sockets import Batch, Bytes, Ints, joined
+from sim_vehicles.services.frames import PAYLOAD, first_message
+from sim_vehicles.services.mavlink import TARGETS, TO_ALL, TO_NONE
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
@@ -37,3 +40,47 @@ def datagrams_of(datagrams: Sequence[Datagram], rows: Mapping[int, int]) -> Data
     stream, ends = joined([data for _, data, _ in datagrams])
     numbers = [ends[:-1], ends[1:], [rows[key] for key, _, _ in datagrams], [time_ns for _, _, time_ns in datagrams]]
     return Datagrams(stream, np.array(numbers, np.int64), [*rows])
+
+
+def to_vehicles(batch: Batch, behind: Ints, wire_ids: Ints) -> Ints:
+    """The table of `Datagrams` for what was read from the vehicles' sockets.
+
+    Behind the socket with descriptor d are the vehicles in the rows from `behind[d, 0]` up to `behind[d, 1]`, whose
+    MAVLink system ids are in `wire_ids`. If they are several, a frame goes to the one that is its target, and a
+    heartbeat or a frame to system 0 to all; what concerns no vehicle goes to the first, which counts it.
+    """
+    return _to_vehicles(batch.stream, batch.table, behind, wire_ids, TARGETS)
+
+
+@array_kernel
+def _to_vehicles(stream: Bytes, table: Ints, behind: Ints, wire_ids: Ints, targets: Ints) -> Ints:
+    count, total = table.shape[1], 0
+    rows = np.empty((count, 2), np.int64)
+    for k in range(count):
+        first, stop = behind[table[4, k], 0], behind[table[4, k], 1]
+        if stop > first + 1:
+            target = _target(stream[table[0, k] : table[1, k]], targets)
+            if target:
+                row = first
+                while row < stop and wire_ids[row] != target:
+                    row += 1
+                first = row if row < stop else first
+                stop = first + 1
+        rows[k, 0], rows[k, 1] = first, stop
+        total += stop - first
+    out, place = np.empty((4, total), np.int64), 0
+    for k in range(count):
+        for row in range(rows[k, 0], rows[k, 1]):
+            out[0, place], out[1, place], out[2, place], out[3, place] = table[0, k], table[1, k], row, table[3, k]
+            place += 1
+    return out
+
+
+@kernel
+def _target(frame: Bytes, targets: Ints) -> int:
+    """The system that is the target of a datagram's first frame: 0 for all, TO_NONE if no vehicle is."""
+    number = int64(first_message(frame, len(frame)))
+    place = targets[number] if number < len(targets) else TO_NONE
+    if place < 0:
+        return 0 if place == TO_ALL else TO_NONE
+    return int64(frame[PAYLOAD + place]) if place < frame[1] and PAYLOAD + place < len(frame) else 0

@@ -1,4 +1,4 @@
-"""Vehicles on real UDP, with one thread and one socket per vehicle.
+"""Vehicles on real UDP, with one thread, and one socket per vehicle or per network.
 
 The operating system timestamps each arrival, so the emulated down link begins when the datagram reached the host, not
 when this loop read it. Datagrams leave within some tens of microseconds of their due time.
@@ -13,11 +13,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from scenarios.networks import network_of
+from scenarios.networks import network_of, wire_id
 from scenarios.schema import NS_PER_S
 from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, joined, number_of, stamped, write
 from scenarios.undisturbed import undisturbed
-from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of
+from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of, to_vehicles
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """The loop busy-waits for this long before a due time, because with few vehicles late wake-ups are most of the error.
@@ -37,16 +37,20 @@ _OTHER_FILES = 100
 
 
 class Sockets:
-    """All sockets of the process: waits for them, reads them, sends, and counts late datagrams."""
+    """All sockets of the process: waits for them, reads them, sends, and counts late datagrams.
 
-    def __init__(self) -> None:
+    Each is shared by `vehicles_each` vehicles, whose frames share datagrams if there are several.
+    """
+
+    def __init__(self, vehicles_each: int = 1) -> None:
         self.counters: Counter[str] = Counter()
         """`send_refused` (nobody listens at the port), `send_failed`, `receive_refused`, `left_late`."""
         self.latest_ns = 0
         """The largest lateness among those counted as `left_late`; a reader may reset it to 0."""
         self._epoll = select.epoll()
         self._sockets: dict[int, socket.socket] = {}
-        self._reader = Reader(READ_OF_EACH)
+        self._vehicles_each = vehicles_each
+        self._reader = Reader(READ_OF_EACH * vehicles_each, together=vehicles_each > 1)
         self._woken_ns = time.monotonic_ns()
 
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
@@ -64,6 +68,10 @@ class Sockets:
         self._epoll.register(own, select.EPOLLIN)
         return number
 
+    @property
+    def count(self) -> int:
+        return len(self._sockets)
+
     def close(self) -> None:
         self._epoll.close()
         for own in self._sockets.values():
@@ -72,8 +80,9 @@ class Sockets:
     def wait(self, until_ns: int) -> None:
         """Sleep until a time, or until a datagram has arrived."""
         # select, because epoll rounds its timeouts up to whole milliseconds
-        spin_ns = min(LONGEST_SPIN_NS, SPIN_OF_ALL_NS // max(1, len(self._sockets)))
-        together_ns = self._woken_ns + TOGETHER_NS * len(self._sockets)
+        vehicles = self._vehicles_each * len(self._sockets)
+        spin_ns = min(LONGEST_SPIN_NS, SPIN_OF_ALL_NS // max(1, vehicles))
+        together_ns = self._woken_ns + TOGETHER_NS * vehicles
         remaining_ns = max(until_ns, together_ns) - spin_ns - time.monotonic_ns()
         if remaining_ns > 0 and select.select((self._epoll,), (), (), remaining_ns / NS_PER_S)[0]:
             until_ns = 0
@@ -97,7 +106,7 @@ class Sockets:
         """
         begins, ends, descriptors, due_ns = table
         to = np.full(len(due_ns), NO_ADDRESS) if addresses is None else addresses
-        sent_ns, refused, failed = write(stream, begins, ends, descriptors, to)
+        sent_ns, refused, failed = write(stream, begins, ends, descriptors, to, self._reader.buffers)
         self.counters["send_refused"] += refused
         self.counters["send_failed"] += failed
         late_ns = sent_ns - due_ns
@@ -117,39 +126,47 @@ class Sockets:
 class Ports:
     """The vehicles' sockets, each connected to the station, so that datagrams from others are not accepted.
 
-    `station` is where the station listens to network 0; network k has the port k above. Raises OSError if an address
-    cannot be used, or too few files may be open.
+    Each vehicle has its own. With `one_port`, each network has one, where a frame reaches the vehicle that is its
+    target, or all vehicles if it names none of them. `station` is where the station listens to network 0; network k has
+    the port k above. Raises OSError if an address cannot be used, or too few files may be open.
     """
 
-    def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int]) -> None:
-        self.sockets = Sockets()
+    def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int], *, one_port: bool = False) -> None:
+        sharing: dict[int, list[int]] = {}
+        for row, key in enumerate(system_ids):
+            sharing.setdefault(network_of(key) if one_port else key, []).append(row)
+        self.sockets = Sockets(max(map(len, sharing.values()), default=1))
+        self._numbers = np.zeros(len(system_ids), np.int64)
+        """The descriptor of each vehicle's socket."""
         try:
-            _allow_open(len(system_ids) + _OTHER_FILES)
+            _allow_open(len(sharing) + _OTHER_FILES)
             host, port = station
-            opened = [self.sockets.add(connect=(host, port + network_of(key))) for key in system_ids]
+            for rows in sharing.values():
+                self._numbers[rows] = self.sockets.add(connect=(host, port + network_of(system_ids[rows[0]])))
         except OSError:
             self.sockets.close()
             raise
         self._system_ids = system_ids
-        self._numbers = np.array(opened, np.int64)
-        self._rows = np.zeros(self._numbers.max(initial=0) + 1, np.int64)
-        """The vehicles' rows by descriptor."""
-        self._rows[self._numbers] = range(len(system_ids))
+        self._wire_ids = np.array([*map(wire_id, system_ids)], np.int64)
+        self._behind = np.zeros((self._numbers.max(initial=0) + 1, 2), np.int64)
+        """The rows of the vehicles behind each descriptor, from the first up to the second number."""
+        for rows in sharing.values():
+            self._behind[self._numbers[rows[0]]] = rows[0], rows[-1] + 1
         self.send([])  # so that nothing is compiled in flight
         self.receive()
 
     def receive(self) -> Datagrams:
         """The datagrams that have arrived, with the times at which they reached this host."""
         batch = self.sockets.receive()
-        table = batch.table[:4]
-        table[2] = self._rows[batch.table[4]]
-        return Datagrams(batch.stream, table, self._system_ids)
+        return Datagrams(batch.stream, to_vehicles(batch, self._behind, self._wire_ids), self._system_ids)
 
     def send(self, datagrams: Datagrams | list[Datagram]) -> None:
         if not isinstance(datagrams, Datagrams):
             datagrams = datagrams_of(datagrams, {system_id: row for row, system_id in enumerate(self._system_ids)})
         table = datagrams.table.copy()
         table[2] = self._numbers[table[2]]
+        if len(self._numbers) > self.sockets.count:
+            table = table[:, table[2].argsort(kind="stable")]  # those of one socket travel together
         self.sockets.send(datagrams.stream, table)
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.kernel import Cell, at_row
@@ -52,6 +53,25 @@ CRC_EXTRA: dict[int, bytes] = {
     number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items() if number != SETUP_SIGNING
 }
 """CRC_EXTRA of the accepted messages. SETUP_SIGNING is not among them: no key is accepted from a link."""
+TO_ALL, TO_NONE = -1, -2
+
+
+def _targets() -> NDArray[np.int64]:
+    places = np.full(_MESSAGES, TO_NONE)
+    for number, message in dialect.mavlink_map.items():
+        if number < _MESSAGES and "target_system" in message.fieldnames:
+            field = message.orders[message.fieldnames.index("target_system")]
+            numbered = message.unpacker.unpack(bytes(range(message.unpacker.size)))  # each byte holds its place
+            places[number] = numbered[sum(message.lengths[:field])]
+    places[HEARTBEAT] = TO_ALL
+    places[frames.TIMESYNC] = 16  # an extension that pymavlink's dialect lacks
+    return places
+
+
+_MESSAGES = 512  # the ids of all that stations send to a vehicle are below
+TARGETS = _targets()
+"""Where in its payload a message, by id, names its target system. TO_ALL: nowhere, it is for everybody; TO_NONE: no
+vehicle acts on it."""
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
 _DECODER = dialect.MAVLink(None)

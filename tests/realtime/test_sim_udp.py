@@ -5,13 +5,20 @@ import socket
 import statistics
 import time  # noqa: TID251 - what is tested here is the clock
 from collections.abc import Generator
+from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.drive.udp import Ports
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000
+
+
+def heartbeat(source: int) -> bytes:
+    link: Any = dialect.MAVLink(None, srcSystem=source % 1000)
+    return bytes(link.heartbeat_encode(2, 3, 1, 0, 3).pack(link))
 
 
 @pytest.fixture
@@ -102,3 +109,37 @@ def test_a_dead_station_is_counted_and_its_successor_is_found(station: socket.so
         restarted.settimeout(5.0)
         ports.send([(1, b"again", 0)])
         assert restarted.recvfrom(100)[0] == b"again"
+
+
+def test_vehicles_at_one_port_get_what_is_addressed_to_them(station: socket.socket) -> None:
+    opened = Ports((1, 7, 9), station.getsockname(), one_port=True)
+    link: Any = dialect.MAVLink(None, srcSystem=255)
+    try:
+        opened.send([(1, heartbeat(1), 0), (7, heartbeat(7), 0)])
+        data, address = station.recvfrom(2000)
+        assert data == heartbeat(1) + heartbeat(7)
+        beat = link.heartbeat_encode(6, 8, 0, 0, 4).pack(link)
+        to_7, to_all = (link.command_long_encode(own, 1, 400, 0, *[1.0] * 7).pack(link) for own in (7, 0))
+        elsewhere = link.command_long_encode(8, 1, 400, 0, *[1.0] * 7).pack(link)
+        text = link.statustext_encode(6, b"to nobody").pack(link)
+        station.sendto(to_7 + beat + to_all + elsewhere + text, address)
+        wanted = [(7, to_7), *((own, beat) for own in (1, 7, 9)), *((own, to_all) for own in (1, 7, 9))]
+        opened.sockets.wait(time.monotonic_ns() + 5000 * MS)
+        received = [(system_id, data) for system_id, data, _ in opened.receive()]
+        assert received == [*wanted, (1, elsewhere), (1, text)]
+    finally:
+        opened.sockets.close()
+
+
+def test_networks_at_one_port_each_reach_their_own_station_port(station: socket.socket) -> None:
+    host, port = station.getsockname()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as next_network:
+        next_network.bind((host, port + 1))
+        next_network.settimeout(5.0)
+        opened = Ports((1, 2, 1001, 1002), (host, port), one_port=True)
+        try:
+            opened.send([(key, heartbeat(key), 0) for key in (1, 1001, 2, 1002)])
+            assert station.recv(2000) == heartbeat(1) + heartbeat(2)
+            assert next_network.recv(2000) == heartbeat(1) + heartbeat(2)
+        finally:
+            opened.sockets.close()

@@ -36,7 +36,9 @@ def test_what_is_written_is_read_with_its_sender_and_time(two: tuple[socket.sock
     stream, ends = joined(data)
     before_ns = time.monotonic_ns()
     to = np.full(len(data), number_of(other.getsockname()))
-    sent_ns, refused, failed = write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to)
+    sent_ns, refused, failed = write(
+        stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to, Reader().buffers
+    )
     assert (refused, failed) == (0, 0)
     assert before_ns < sent_ns[0]
     assert (np.diff(sent_ns) > 0).all()
@@ -45,6 +47,46 @@ def test_what_is_written_is_read_with_its_sender_and_time(two: tuple[socket.sock
     assert {(found.descriptor, found.address) for found in batch} == {(other.fileno(), one.getsockname())}
     assert (batch.table[3] <= batch.read_ns).all()
     assert other.getsockname() not in {found.address for found in batch}
+
+
+def frames_of(*sizes: int) -> list[bytes]:
+    """MAVLink 2 frames as far as their size tells: magic, size of the payload, the rest zero."""
+    return [bytes([0xFD, size]) + bytes(10 + size) for size in sizes]
+
+
+def test_frames_together_share_datagrams_and_are_read_one_by_one(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    signed, version_1 = b"\xfd\x02\x01" + bytes(24), b"\xfe\x03" + bytes(9)
+    data = [*frames_of(*range(0, 250, 10)), signed, version_1]
+    stream, ends = joined(data)
+    to, reader = np.full(len(data), number_of(other.getsockname())), Reader(together=True)
+    sent_ns, *_ = write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to, reader.buffers)
+    raw = [other.recv(2048) for _ in range(len(set(sent_ns.tolist())))]
+    assert b"".join(raw) == b"".join(data)
+    assert len(raw) < 5
+    assert max(map(len, raw)) <= 1400
+    for each in raw:
+        one.sendto(each, other.getsockname())
+    assert [found.data for found in reader.read([other.fileno()])] == data
+
+
+def test_frames_together_go_only_to_one_address(two: tuple[socket.socket, socket.socket]) -> None:
+    one, other = two
+    data = frames_of(1, 2, 3)
+    stream, ends = joined(data)
+    to = np.array([number_of(own.getsockname()) for own in (one, other, one)])
+    write(stream, ends[:-1], ends[1:], np.full(3, one.fileno()), to, Reader(together=True).buffers)
+    assert [one.recv(2048), other.recv(2048), one.recv(2048)] == [data[0], data[1], data[2]]
+
+
+@pytest.mark.parametrize("spoiled", [b"", b"\xfd", b"\xfd\xff\x00", b"noise", b"\xfe\x30" + bytes(8)])
+def test_what_is_not_frames_alone_is_read_whole(two: tuple[socket.socket, socket.socket], spoiled: bytes) -> None:
+    one, other = two
+    data = b"".join(frames_of(5, 6)) + spoiled
+    one.sendto(data, other.getsockname())
+    one.sendto(spoiled, other.getsockname())
+    whole = [data] if spoiled else frames_of(5, 6)
+    assert [found.data for found in Reader(together=True).read([other.fileno()])] == [*whole, spoiled]
 
 
 def test_one_read_takes_a_limited_number_from_each_socket(two: tuple[socket.socket, socket.socket]) -> None:
@@ -82,10 +124,10 @@ def test_closed_ports_are_counted_and_do_not_stop_what_follows(two: tuple[socket
     counts = [0, 0]
     reader = Reader()
     for _ in range(3):
-        _, refused, _ = write(stream, ends[:-1], ends[1:], descriptors, to)
+        _, refused, _ = write(stream, ends[:-1], ends[1:], descriptors, to, reader.buffers)
         counts[0] += refused
         counts[1] += reader.read([one.fileno()]).errors
     assert sum(counts) >= 3
     assert [found.data for found in reader.read([other.fileno()])] == [b"to you"] * 3
-    _, _, failed = write(stream, ends[:1], ends[1:2], np.array([10_000]), np.array([NO_ADDRESS]))
+    _, _, failed = write(stream, ends[:1], ends[1:2], np.array([10_000]), np.array([NO_ADDRESS]), reader.buffers)
     assert failed == 1

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.startup import WITHOUT_TARGET
 from gcs.link.vehicle import heartbeat_state
 from gcs.plan.flight_plan import FlightPlan
@@ -144,6 +144,27 @@ def test_a_vehicle_that_restarts_its_sequence_numbers_is_heard() -> None:
         station.step([peer.heartbeat(second * S, base_mode=1)], second * S)
     assert not vehicle.armed
     assert vehicle.frames.lost == 0
+
+
+def targets_and_heartbeats(own: Address) -> tuple[list[int], int]:
+    """The targets of a station's TIMESYNC requests in five seconds, and its heartbeats, with vehicle 3 at `own`.
+
+    The others are at HOME. The target is an extension that pymavlink's dialect lacks; 0 where it is not sent.
+    """
+    station, peers = Station(PLAN, start_ns=S), [Peer(1), Peer(2), Peer(3, own)]
+    station.step([peer.heartbeat(S) for peer in peers], S)
+    sent: list[bytes] = []
+    while (now_ns := station.next_event_ns) < 6 * S:
+        sent += [data for data, _ in station.step([], now_ns)[0]]
+    requests = [data for data in sent if data[7:10] == (111).to_bytes(3, "little")]
+    return [data[10 + 16] if data[1] > 16 else 0 for data in requests], sum(data[7:10] == bytes(3) for data in sent)
+
+
+def test_vehicles_at_one_port_share_heartbeats_and_are_asked_by_name() -> None:
+    targets, heartbeats = targets_and_heartbeats(HOME)
+    assert (set(targets), heartbeats) == ({1, 2, 3}, 5)
+    targets, heartbeats = targets_and_heartbeats(address_at("127.0.0.1", 6666))
+    assert (set(targets), heartbeats) == ({0, 1, 2}, 10)
 
 
 def test_unknown_system_id_is_counted_and_not_answered() -> None:
