@@ -17,7 +17,6 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable
 from math import nan
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,14 +27,12 @@ from gcs.link.datagram import Address, Datagram, Outgoing
 from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import SILENCE_S, RemoteVehicle
+from gcs.plan.design import Design
 from gcs.published import Published
 from gcs.runs.summary import estimate
 from gcs.runs.summary_record import Clock, Estimate
 from gcs.station.reception import ANOTHER_ADDRESS, NOT_FINITE
 from scenarios.schema import NS_PER_S, Rates
-
-if TYPE_CHECKING:
-    from gcs.plan.design import Design
 
 SYSTEM_ID = 254
 """System id of the watch's requests. It differs from a station's, whose sequence numbers vehicles track."""
@@ -331,7 +328,7 @@ class Watch:
                 vehicle.look(now_ns, asked=bool(self.stations))
         return self._look_ns
 
-    def figures(self, now_ns: int, design: "Design | None", last: int = 0) -> list[LinkFigures]:
+    def figures(self, now_ns: int, design: Design | None, last: int = 0) -> list[LinkFigures]:
         """The figures of each vehicle, in order of system id, with the headroom to its margin in a design, if given."""
         margins_s = {own: None if design is None else design.margin_of(own) for own in sorted(self.vehicles)}
         return [self.vehicles[own].figures(now_ns, margin_s, last) for own, margin_s in margins_s.items()]

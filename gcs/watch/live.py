@@ -7,19 +7,16 @@ no heartbeat, which could hide from a vehicle that its station is gone.
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
 from gcs.link.datagram import network_at
+from gcs.plan.design import Design
 from gcs.views.console import draw, live_display
 from gcs.watch.links import Requests, Watch, WatchReport, prepare
 from gcs.watch.saved_links import LinkRecorder
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S
-
-if TYPE_CHECKING:
-    from gcs.plan.design import Design
 
 _SHOW_NS = NS_PER_S // 4
 _PLAIN_NS = 5 * NS_PER_S
@@ -32,7 +29,7 @@ def watch_links(
     watch: Watch,
     stop_reason: Callable[[], str],
     *,
-    design: "Design | None",
+    design: Design | None,
     margin_of: str,
     timesync_hz: float,
     position_hz: float,
