@@ -5,7 +5,7 @@ Lines are thinned to the extremes of each column of the picture: no peak is lost
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, floor, isfinite, log10
+from math import ceil, floor, log10
 
 import numpy as np
 
@@ -112,11 +112,6 @@ def _thinned(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
 
 def _runs(time_s: FloatArray, line: Line) -> list[list[tuple[float, float]]]:
     """The thinned line, split at values that are not finite."""
-    runs: list[list[tuple[float, float]]] = [[]]
     times_s, values = _thinned(time_s, line.values)
-    for at_s, value in zip(times_s.tolist(), values.tolist(), strict=True):
-        if isfinite(value):
-            runs[-1].append((at_s, value))
-        elif runs[-1]:
-            runs.append([])
-    return [run for run in runs if run]
+    parts = np.ma.clump_unmasked(np.ma.masked_invalid(values))
+    return [list(zip(times_s[part].tolist(), values[part].tolist(), strict=True)) for part in parts]
