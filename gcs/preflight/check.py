@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 from functools import partial
-from math import hypot, inf, isfinite
+from math import hypot, inf
 
 import numpy as np
 from pydantic import Field
 
 from gains.core.arrays import FloatArray
+from gains.core.requirement import plain
 from gcs.control.loop_delay import headroom
 from gcs.plan.course import PlannedMotion, nearest_planned
 from gcs.plan.design import CodeRecord
@@ -158,8 +159,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
                 command_m_s2=float(hypot(*commands[model.input_slice(row)])),
                 command_max_m_s2=most if most < inf else None,
                 expected_loop_delay_s=at_s,
-                headroom=None if at_s is None else _known(_headroom(plan, row, at_s, at_s)),
-                link_delay_left_s=_known(left_s.get(vehicle.system_id, inf)),
+                headroom=None if at_s is None else plain(_headroom(plan, row, at_s, at_s)),
+                link_delay_left_s=plain(left_s.get(vehicle.system_id, inf)),
             )
         )
     delay_s = max(delays_s.values())
@@ -174,8 +175,8 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
         phase_s=_phase_s(scenario),
-        effective_loop_delay_s=_known(effective_s[critical]),
-        effective_headroom=_known(left[critical]),
+        effective_loop_delay_s=plain(effective_s[critical]),
+        effective_headroom=plain(left[critical]),
         channels_not_included=bool(use) and inf in effective_s.values(),
         channel_use=use,
         outage_s=max(_outages_s(scenario), default=None),
@@ -246,7 +247,7 @@ def _late_headroom(plan: FlightPlan, drawn: dict[int, DrawnDelays]) -> float | N
             mismatch_s = own.loop_s if prediction == "off" else own.down_s + own.ages_s.mean() - assumed_s
             waits_s = (-wait_s, wait_s) if prediction not in {"measured", "off"} else (0.0,)
             late[kind] = min(_kept(mismatch_s + each_s, tolerated) for each_s in waits_s)
-    return _known(min(late.values()))
+    return plain(min(late.values()))
 
 
 def _kept(mismatch_s: FloatArray, tolerated: Tolerated) -> float:
@@ -262,10 +263,6 @@ def _outages_s(scenario: Scenario) -> Iterator[float]:
             for outage in link.outages:
                 if outage.from_s < scenario.duration_s:
                     yield min(outage.until_s, scenario.duration_s) - outage.from_s
-
-
-def _known(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _response_differs(scenario: Scenario) -> dict[str, tuple[float | None, float | None]]:
