@@ -20,7 +20,6 @@ import numpy as np
 from gcs.control.tick import Event, TickArray
 from gcs.link.datagram import NETWORK_BIT, Arrivals, Frames, network_at
 from scenarios.kernel import Array, kernel
-from scenarios.sockets import Ints
 
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
@@ -131,7 +130,9 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
     entries: dict[int, list[bytes]] = defaultdict(list)
     for part in frames.parts:
         if isinstance(part, Arrivals):
-            for network, table in _by_network(part).items():
+            networks = part.table[2] >> NETWORK_BIT
+            for network in np.unique(networks).tolist():
+                table = part.table[:, networks == network]
                 own = np.empty(int((table[1] - table[0]).sum()) + _STAMP.size * table.shape[1], np.uint8)
                 _fill(own, part.stream, table, epoch_ns)
                 entries[network].append(own.tobytes())
@@ -139,11 +140,6 @@ def tlog_entries(frames: Frames, epoch_ns: int = 0) -> dict[int, bytes]:
             frame, time_ns, address = part
             entries[network_at(address)] += (_STAMP.pack((epoch_ns + time_ns) // 1000), frame)
     return {network: b"".join(parts) for network, parts in entries.items()}
-
-
-def _by_network(arrivals: Arrivals) -> dict[int, Ints]:
-    of_rows = arrivals.table[2] >> NETWORK_BIT
-    return {network: arrivals.table[:, of_rows == network] for network in np.unique(of_rows).tolist()}
 
 
 @kernel
