@@ -92,8 +92,7 @@ def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path
 
     Raises ScenarioError if the scenario cannot be flown with this loop.
     """
-    control = scenario.control.model_copy(update={"loop": loop})
-    return checked(scenario.model_copy(update={"control": control}), file)
+    return checked(scenario.with_keys(control={"loop": loop}), file)
 
 
 def checked(scenario: Scenario, file: Path) -> Scenario:

@@ -9,7 +9,7 @@ The docstring below a key describes it in `scenario.schema.json` and the referen
 from collections.abc import Callable
 from math import ceil, inf
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
@@ -438,20 +438,24 @@ class Scenario(Part):
 
     def with_calm_monitor(self) -> Self:
         """The same scenario with a monitor that only watches, and without slower gains to switch to."""
-        monitor = self.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
-        return self.model_copy(update={"monitor": monitor})
+        return self.with_keys(monitor={"act": False, "time_scales": (1.0,)})
+
+    def with_keys(self, **parts: dict[str, Any]) -> Self:
+        """The same scenario with some keys of its parts changed, unchecked: `with_keys(control={"alpha": 0.9})`."""
+        changed = {part: getattr(self, part).model_copy(update=keys) for part, keys in parts.items()}
+        return self.model_copy(update=changed)
 
     def at_rates(self, *, control_hz: float, telemetry_hz: float) -> Self:
         """The same scenario with other rates of control and telemetry.
 
         Sensor and loop on board run at the lowest multiples of the control rate that are no slower than before.
         """
-        rates = self.rates.model_copy(update={"control_hz": control_hz, "telemetry_hz": telemetry_hz})
+        changed = self.with_keys(rates={"control_hz": control_hz, "telemetry_hz": telemetry_hz})
         if self.control.loop != "onboard":
-            return self.model_copy(update={"rates": rates})
+            return changed
         sensor_hz = control_hz * ceil(self.onboard.sensor_hz / control_hz)
-        onboard = {"sensor_hz": sensor_hz, "rate_hz": sensor_hz * ceil(self.onboard.rate_hz / sensor_hz)}
-        return self.model_copy(update={"rates": rates, "onboard": self.onboard.model_copy(update=onboard)})
+        own_hz = sensor_hz * ceil(self.onboard.rate_hz / sensor_hz)
+        return changed.with_keys(onboard={"sensor_hz": sensor_hz, "rate_hz": own_hz})
 
     def with_link_delay(self, *, up_s: float | None, down_s: float | None) -> Self:
         """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is.
@@ -475,4 +479,4 @@ class Scenario(Part):
             for v in self.links.vehicles
         )
         links = {"up": change_up(self.links.up), "down": change_down(self.links.down), "vehicles": own}
-        return self.model_copy(update={"links": self.links.model_copy(update=links)})
+        return self.with_keys(links=links)

@@ -41,7 +41,7 @@ def _loops() -> dict[str, Predicted]:
 
     at_50_hz, dead = Timing(0.02, 0.02), Response(0.15, 0.0, 0.05)
     thesis = load(ROOT / "scenarios/thesis_delay.toml")
-    thesis = thesis.model_copy(update={"control": thesis.control.model_copy(update={"prediction": 1.0})})
+    thesis = thesis.with_keys(control={"prediction": 1.0})
     plan = flight_plan(thesis)[1]
     return {
         "vehicles that respond at once, 50 Hz": loop(fast, at_50_hz),

@@ -288,8 +288,7 @@ def design(
 
     scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
     if method is not None:
-        control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()} | NO_LAW)
-        scenario = scenario.model_copy(update={"control": control})
+        scenario = scenario.with_keys(control={"method": method, "gains": None, "blocks": ()} | NO_LAW)
     options.refuse_alone("--save", save, "--at or --links-of", at, links_of)
     options.refuse_alone("--predict", predict, "--at", at)
     options.refuse_alone("--picture", picture, "--front", front or None)

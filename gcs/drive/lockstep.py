@@ -109,8 +109,7 @@ class _Joining:
 def prepare(plan: FlightPlan) -> None:
     """Compile all kernels before a flight in real time, by flying the beginning of the plan with plain vehicles."""
     plain = {"dynamics": "double_integrator", "links": Links(), "response": None}
-    control = plan.scenario.control.model_copy(update={"execute_at": False})
-    scenario = plan.scenario.model_copy(update=plain | {"control": control})
+    scenario = plan.scenario.model_copy(update=plain).with_keys(control={"execute_at": False})
     station = Station(replace(plan, scenario=scenario, law=None, responses=None), start_ns=START_NS)
     flown, vehicles = 0, _Joining(vehicles_of(scenario))
     for _ in fly_lockstep(station.plan, station=station, vehicles=vehicles):

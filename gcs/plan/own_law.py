@@ -139,11 +139,9 @@ def own_plan(
         )
         return design, plan
     _check(scenario, law, given, known)
-    control = scenario.control.model_copy(
-        update={"method": "inclusion", "controller": None, "linear": None, "blocks": gain_blocks(given, formation)}
-    )
-    monitor = scenario.monitor.model_copy(update={"time_scales": (1.0,)})  # a law cannot be slowed down
-    design, plan = given_plan(scenario.model_copy(update={"control": control, "monitor": monitor}))
+    control = {"method": "inclusion", "controller": None, "linear": None, "blocks": gain_blocks(given, formation)}
+    monitor = {"time_scales": (1.0,)}  # a law cannot be slowed down
+    design, plan = given_plan(scenario.with_keys(control=control, monitor=monitor))
     design = design.model_copy(update={"method": "python", "code": code_records(scenario)})
     return design, replace(plan, scenario=scenario, law=law, around_loss=())
 

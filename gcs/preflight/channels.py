@@ -68,10 +68,9 @@ def over_channels(plan: FlightPlan) -> OverChannels:
 
 def _over_wide(plan: FlightPlan) -> FlightPlan:
     """The plan over channels so wide that nothing is dropped."""
-    links = plan.scenario.links
-    wide = (each.model_copy(update={"bandwidth_bit_s": _WIDE * each.bandwidth_bit_s}) for each in links.channels)
-    links = links.model_copy(update={"channels": tuple(wide)})
-    return replace(plan, scenario=plan.scenario.model_copy(update={"links": links}))
+    channels = plan.scenario.links.channels
+    wide = (each.model_copy(update={"bandwidth_bit_s": _WIDE * each.bandwidth_bit_s}) for each in channels)
+    return replace(plan, scenario=plan.scenario.with_keys(links={"channels": tuple(wide)}))
 
 
 def _start(plan: FlightPlan, seed: int) -> OverChannels:

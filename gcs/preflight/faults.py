@@ -45,8 +45,7 @@ def unstable_loop(plan: FlightPlan) -> str | None:
 
 def without_actions(plan: FlightPlan) -> FlightPlan:
     """The plan with a monitor that only watches, for a loop without a margin to keep."""
-    monitor = plan.scenario.monitor.model_copy(update={"act": False})
-    return replace(plan, scenario=plan.scenario.model_copy(update={"monitor": monitor}))
+    return replace(plan, scenario=plan.scenario.with_keys(monitor={"act": False}))
 
 
 def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:

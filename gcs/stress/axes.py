@@ -95,10 +95,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
     if PREDICTION in coordinates:
-        prediction = coordinates[PREDICTION] or "off"
-        scenario = scenario.model_copy(
-            update={"control": scenario.control.model_copy(update={"prediction": prediction})}
-        )
+        scenario = scenario.with_keys(control={"prediction": coordinates[PREDICTION] or "off"})
     if "delay" in coordinates:
         up_s, down_s = split_delay(coordinates["delay"], 1.0 / scenario.rates.control_hz)
         scenario = scenario.with_link_delay(up_s=up_s, down_s=down_s)
@@ -165,4 +162,4 @@ def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> S
     up, down = (link.model_copy(update={"delay_s": own_s, "delay_points": ()}) for link, own_s in links)
     own = VehicleLinks(system_id=system_id, up=up, down=down)
     others = tuple(links for links in scenario.links.vehicles if links.system_id != system_id)
-    return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})
+    return scenario.with_keys(links={"vehicles": (*others, own)})

@@ -154,7 +154,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     if scenario.starts_on_ground:
         scenario, duration_s = _at_rest(scenario), PROBE_S if plan.assumed_s is None else _HIDDEN_MODE_S
     if has_constant_links(scenario):
-        scenario = scenario.model_copy(update={"clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})})
+        scenario = scenario.with_keys(clocks={"drift_max_ppm": 0.0})
     elif isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
     sector = scenario.disturbance and scenario.disturbance.sector
@@ -181,24 +181,22 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "duration_s": duration_s,
         "disturbance": sector and Disturbance(sector=sector),  # it depends on the errors, so it is part of the loop
         "navigation": None,
-        "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
-        "safety": scenario.safety.model_copy(
-            update={
-                "setpoint_timeout_s": 2.0 * duration_s,
-                "heartbeat_timeout_s": 2.0 * duration_s,
-                "spacing_error_limit_m": Safety().spacing_error_limit_m,
-            }
-        ),
     }
-    return scenario.model_copy(update=update)
+    return scenario.model_copy(update=update).with_keys(
+        onboard={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0},
+        safety={
+            "setpoint_timeout_s": 2.0 * duration_s,
+            "heartbeat_timeout_s": 2.0 * duration_s,
+            "spacing_error_limit_m": Safety().spacing_error_limit_m,
+        },
+    )
 
 
 def _at_rest(scenario: Scenario) -> Scenario:
     """The scenario with hovering autopilots whose local frames share an origin and whose clocks do not jump."""
     still = NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0))
     exact = {"origin_spread_m": 0.0, "clock_jumps": (), "sitl": Sitl()}
-    changes = {"nominal_velocity": (still,), "autopilot": scenario.autopilot.model_copy(update=exact)}
-    return scenario.model_copy(update=changes)
+    return scenario.model_copy(update={"nominal_velocity": (still,)}).with_keys(autopilot=exact)
 
 
 def probe_scenario(
@@ -210,11 +208,9 @@ def probe_scenario(
     """
     scenario = in_place(plan, system_ids, amplitude=amplitude)
     up, down = with_waiting(*links, period_s=plan.timing.step_s, waiting_s=waiting_s)
-    update = {
-        "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
-        "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),
-    }
-    return scenario.model_copy(update=update)
+    return scenario.with_keys(
+        links={"up": up, "down": down, "vehicles": ()}, clocks={"drift_max_ppm": 0.0, "offset_max_s": 0.0}
+    )
 
 
 def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> tuple[Link, Link]:

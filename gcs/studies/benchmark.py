@@ -221,8 +221,7 @@ def without_solver(scenario: Scenario, seconds: float) -> Scenario:
     """The scenario, shortened to `seconds` and with given gains, whose design needs no solver."""
     requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
     given = {"method": "inclusion", "gains": GAINS, "blocks": ()}
-    control = scenario.control.model_copy(update=requirement | given)
-    return scenario.model_copy(update={"duration_s": seconds, "control": control})
+    return scenario.with_keys(control=requirement | given).model_copy(update={"duration_s": seconds})
 
 
 def first_unsupported_key(scenario: Scenario) -> str | None:

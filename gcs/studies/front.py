@@ -109,10 +109,9 @@ def searched_in(scenario: Scenario, methods: Sequence[Method]) -> FrontSearch:
         wanted = f"at most {MOST_VEHICLES} with --front or --at; gains by inclusion are those of a smaller formation"
         raise InputError(f"{scenario.name}: read {len(scenario.vehicles)} vehicles, wanted {wanted}")
     formation = plan_formation(scenario)
-    cleared = scenario.model_copy(update={"control": scenario.control.model_copy(update={"blocks": ()})})
     return FrontSearch(
         formation.model,
-        pattern_of(cleared, formation),
+        pattern_of(scenario.with_keys(control={"blocks": ()}), formation),
         loop_timing(scenario).held_s,
         string_peak_max=scenario.control.string_peak_max,
         response=response,

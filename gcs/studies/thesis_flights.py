@@ -80,13 +80,11 @@ def flown(name: str, method: str) -> tuple[TickArray, float | None]:
 def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
     """Design and plan of a scenario without link delay, by inclusion with α = 0.93, or by a graph method with the same
     delay margin."""
-    scenario = _scenario(name)
-    control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
-    if method != "inclusion":
-        margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
-        control = control.model_copy(update={"alpha": None, "delay_margin_s": margin_s, "method": method})
-    scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
-    return flight_plan(scenario.model_copy(update={"control": control}))
+    scenario = _scenario(name).with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
+    if method == "inclusion":
+        return flight_plan(scenario.with_keys(control={"delay_margin_s": None, "alpha": ALPHA}))
+    margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
+    return flight_plan(scenario.with_keys(control={"alpha": None, "delay_margin_s": margin_s, "method": method}))
 
 
 def fly_with_late_neighbours(
