@@ -17,7 +17,6 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
 from gcs.control.tick import TickArray, in_sequence
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
-from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.preflight.faults import bad_start, endless_link, unstable_loop
 from gcs.published import json_text
@@ -101,10 +100,8 @@ def capacity(
 
     Each formation flies with `seeds` successive seeds, beginning with the scenario's. Flights last `seconds`, a long
     time because errors decay slowly near the margin. Those in `store` are not flown again; the others are added to it.
-    `ended` is called after each formation with the maximum number left. Raises InputError if `unflyable`.
+    `ended` is called after each formation with the maximum number left. The scenario must not be `unflyable`.
     """
-    if fault := unflyable(scenario, most, seconds):
-        raise InputError(f"{scenario.name}: {fault}")
     scenario = scenario.model_copy(update={"duration_s": seconds})
     found: list[Capacity] = []
     for k, rate_hz in enumerate(rates_hz):
@@ -122,7 +119,7 @@ def capacity(
     return found
 
 
-def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | None:
+def unflyable(scenario: Scenario, most: int) -> str | None:
     """Why formations of up to `most` vehicles cannot be flown with this scenario; None if they can.
 
     They cannot if its gains fit only its own formation, its vehicles take off first, or its start or links are refused.
@@ -132,7 +129,7 @@ def unflyable(scenario: Scenario, most: int, seconds: float = SECONDS) -> str | 
     if scenario.dynamics != "double_integrator":
         wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
         return f"dynamics: read {scenario.dynamics!r}, wanted {wanted}"
-    formed = _displaced(with_vehicles(scenario.model_copy(update={"duration_s": seconds}), most))
+    formed = _displaced(with_vehicles(scenario.model_copy(update={"duration_s": SECONDS}), most))
     return bad_start(formed) or endless_link(formed)
 
 

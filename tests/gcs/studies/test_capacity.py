@@ -104,5 +104,6 @@ def test_bad_rates_are_refused_in_one_line(rates: str) -> None:
 
 @pytest.mark.parametrize(("name", "read"), [("thesis_delay", "control.blocks: read 7"), ("copters5", "'autopilot'")])
 def test_what_it_cannot_fly_is_refused_in_one_line(name: str, read: str) -> None:
-    with pytest.raises(InputError, match=read):
-        capacity(load(RADIO.with_name(f"{name}.toml")), rates_hz=[10.0], most=2)
+    result = CliRunner().invoke(app, ["capacity", name, "--rates", "10", "--most", "2"])
+    assert isinstance(result.exception, InputError)
+    assert read in str(result.exception)
