@@ -30,11 +30,9 @@ def figure_of(
     rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
 ) -> tuple[Any, Any]:
     """A figure that needs no screen, and its plots from the top: (rows,), or (rows, columns) with several columns."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
     plots = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
     for plot in plots.flat:
         plot.grid(visible=True, color="#dddddd", linewidth=0.6)
