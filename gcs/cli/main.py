@@ -122,7 +122,3 @@ def _misread(error: typer.TyperException) -> str:
 def _bad_input(line: str) -> int:
     print(" ".join(line.split()), file=sys.stderr)
     return BAD_INPUT
-
-
-if __name__ == "__main__":
-    main()

@@ -152,7 +152,7 @@ def test_monitors_with_the_key_are_answered_and_others_only_hear(tmp_path: Path)
         watch = [
             sys.executable,
             "-m",
-            "gcs.cli.main",
+            "gcs",
             "monitor",
             "--listen",
             f"127.0.0.1:{port}",

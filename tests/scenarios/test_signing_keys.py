@@ -143,11 +143,11 @@ def test_the_command_makes_a_key_and_prints_nothing(tmp_path: Path) -> None:
     assert again.stderr == f"{file}: exists already, wanted a new file: a key is never overwritten\n"
 
 
-@pytest.mark.parametrize("program", ["gcs.cli.main", "sim_vehicles.drive.cli"])
+@pytest.mark.parametrize("program", ["gcs", "sim_vehicles.drive.cli"])
 def test_a_key_that_others_may_read_gives_exit_code_2(tmp_path: Path, program: str) -> None:
     file = a_file(tmp_path, SECRET, 0o644)
     scenario = SCENARIOS / "chain3.toml"
-    fly = [*(["fly"] if program == "gcs.cli.main" else []), str(scenario), "--key", str(file)]
+    fly = [*(["fly"] if program == "gcs" else []), str(scenario), "--key", str(file)]
     done = subprocess.run(
         [sys.executable, "-m", program, *fly], capture_output=True, text=True, check=False, timeout=60, cwd=tmp_path
     )

@@ -12,7 +12,7 @@ from tests.support.processes import gcs
 
 
 def stress_command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "gcs.cli.main", "stress", *map(str, arguments)]
+    return [sys.executable, "-m", "gcs", "stress", *map(str, arguments)]
 
 
 def stress(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":

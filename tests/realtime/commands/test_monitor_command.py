@@ -19,7 +19,7 @@ from tests.support.processes import PATIENCE_S
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
-MONITOR = [sys.executable, "-m", "gcs.cli.main", "monitor"]
+MONITOR = [sys.executable, "-m", "gcs", "monitor"]
 
 
 def free_address() -> str:

@@ -25,7 +25,7 @@ KINDS = [
 
 
 def command(*arguments: str | Path) -> str:
-    return " ".join([sys.executable, "-m", "gcs.cli.main", *map(str, arguments)]) + "\r"
+    return " ".join([sys.executable, "-m", "gcs", *map(str, arguments)]) + "\r"
 
 
 def start_flight(shown: Terminal, folder: Path) -> None:
