@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-import scenarios
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.requirement import Requirement
 from gains.design.design import design
@@ -21,7 +20,7 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.views.page import figure_of, saved
 from scenarios.files import load
-from scenarios.schema import Scenario
+from scenarios.shipped import FOLDER
 
 PERIOD_S = 0.02
 STEP_S = 1e-3
@@ -40,11 +39,7 @@ _SHOTS = 7
 @cache
 def printed_gains() -> FloatArray:
     """K of section 5.2.2, with the slip "0.5003" corrected, from scenarios/thesis_gains.toml."""
-    return flight_plan(_scenario("thesis_gains"))[1].gain
-
-
-def _scenario(name: str) -> Scenario:
-    return load(Path(scenarios.__file__).parent / f"{name}.toml")
+    return flight_plan(load(FOLDER / "thesis_gains.toml"))[1].gain
 
 
 @cache
@@ -80,7 +75,7 @@ def flown(name: str, method: str) -> tuple[TickArray, float | None]:
 def planned(name: str, method: str) -> tuple[Design, FlightPlan]:
     """Design and plan of a scenario without link delay, by inclusion with α = 0.93, or by a graph method with the same
     delay margin."""
-    scenario = _scenario(name).with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
+    scenario = load(FOLDER / f"{name}.toml").with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
     if method == "inclusion":
         return flight_plan(scenario.with_keys(control={"delay_margin_s": None, "alpha": ALPHA}))
     margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
