@@ -92,7 +92,7 @@ def monitor(
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
         position_hz = scenario.rates.telemetry_hz if scenario else _POSITION_HZ
         watch = Watch((vehicle.system_id for vehicle in scenario.vehicles), scenario.rates) if scenario else Watch()
-        recorder = LinkRecorder(watch) if save_links is not None else None
+        recorder = LinkRecorder() if save_links is not None else None
         with stop_signals() as stop_reason:
             report = watch_links(
                 link,

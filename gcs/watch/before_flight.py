@@ -37,7 +37,7 @@ class _Measurement:
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self.watch = Watch((vehicle.system_id for vehicle in scenario.vehicles), scenario.rates)
-        self.recorder = LinkRecorder(self.watch)
+        self.recorder = LinkRecorder()
         self.patience_s = patience_s(scenario) + MEASURED_S
         self._complete_ns = 0
 
@@ -105,7 +105,7 @@ def _watch_virtually(found: _Measurement, scenario: Scenario) -> None:
     while not found.is_long_enough(now_ns) and now_ns - START_NS < found.patience_s * NS_PER_S:
         for system_id, data, time_ns in vehicles.step(to_vehicles, now_ns):
             for frame in mavlink.in_network(mavlink.decode(data, found.watch.counters), network_of(system_id)):
-                if found.watch.take(frame, time_ns, virtual_address(system_id)) is not None:
-                    found.recorder.note(frame, time_ns)
+                if (vehicle := found.watch.take(frame, time_ns, virtual_address(system_id))) is not None:
+                    found.recorder.note(vehicle, frame, time_ns)
         to_vehicles = [(address & NUMBER_BITS, data, now_ns) for data, address in requests.due(found.watch, now_ns)]
         now_ns = requests.next_ns

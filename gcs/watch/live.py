@@ -71,9 +71,9 @@ def watch_links(
             for datagram in link.receive(watch.counters):
                 frames = mavlink.decode_either(datagram.data, watch.counters)
                 for frame in mavlink.in_network(frames, network_at(datagram.address)):
-                    taken = watch.take(frame, datagram.received_ns, datagram.address)
-                    if recorder is not None and taken is not None:
-                        recorder.note(frame, datagram.received_ns)
+                    vehicle = watch.take(frame, datagram.received_ns, datagram.address)
+                    if recorder is not None and vehicle is not None:
+                        recorder.note(vehicle, frame, datagram.received_ns)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)
             watch.sent(link.send(requests.due(watch, now_ns)))

@@ -19,7 +19,7 @@ from gains.core.arrays import FloatArray
 from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.link.clocks import boot_ns_of, to_station_ns
-from gcs.watch.links import Watch
+from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.keys.link import TRACE_DELAYS, Jitter, Link, LossBursts
 from scenarios.keys.profile import Latency, LinkProfile, Measured
 from scenarios.link_files import dump_profile
@@ -61,14 +61,10 @@ class LinkRecorder:
     These are the autopilots' frames: cameras and gimbals share a vehicle's id but number their frames separately.
     """
 
-    def __init__(self, watch: Watch) -> None:
-        self._watch = watch
+    def __init__(self) -> None:
         self._seen: dict[int, _OneVehicle] = {}
 
-    def note(self, frame: mavlink.Frame, received_ns: int) -> None:
-        vehicle = self._watch.vehicles.get(frame.system_id)
-        if vehicle is None:
-            return
+    def note(self, vehicle: WatchedVehicle, frame: mavlink.Frame, received_ns: int) -> None:
         own = self._seen.setdefault(frame.system_id, _OneVehicle())
         own.frames += 1
         own.count(vehicle.remote.frames.lost)
@@ -121,11 +117,10 @@ class LinkRecorder:
 
 def recorded(frames: Iterable[tuple[int, mavlink.Frame]]) -> LinkRecorder:
     """The delays and losses of the links in a log of any tool."""
-    watch = Watch()
-    recorder = LinkRecorder(watch)
+    watch, recorder = Watch(), LinkRecorder()
     for time_ns, frame in frames:
-        if watch.take(frame, time_ns) is not None:
-            recorder.note(frame, time_ns)
+        if (vehicle := watch.take(frame, time_ns)) is not None:
+            recorder.note(vehicle, frame, time_ns)
     return recorder
 
 
