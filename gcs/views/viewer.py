@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time  # noqa: TID251 (waits for another program)
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from math import floor
 from pathlib import Path
@@ -33,21 +33,18 @@ def refuse_without_viewer() -> None:
         raise InputError(extra_wanted("rerun"))
 
 
-def view(folder_or_rrd: Path) -> int:
+def view(recording: Path) -> int:
     """Open a recording in the Rerun viewer and wait until it is closed; returns its exit code."""
-    recording = find_recording(folder_or_rrd)
     _refuse_without_screen("--picture and --web need none")
     print(f"viewer   {recording}: until its window is closed", flush=True)
     return subprocess.run([_program(), str(recording)], check=False).returncode
 
 
-def serve(folder_or_rrd: Path) -> int:
+def serve(recording: Path) -> int:
     """Serve a recording to the browsers of this machine until Ctrl-C; returns the server's exit code."""
-    recording = find_recording(folder_or_rrd)
     page, data = _free_port(), _free_port()
-    command = [_program(), str(recording), "--serve-web", "--bind", "127.0.0.1"]
-    with raised(), tempfile.TemporaryFile() as log:
-        process = _started([*command, "--port", str(data), "--web-viewer-port", str(page)], log)
+    ports = "--port", str(data), "--web-viewer-port", str(page)
+    with _running(str(recording), "--serve-web", "--bind", "127.0.0.1", *ports) as (process, log):
         try:
             _wait_for(lambda: _listens("127.0.0.1", page) and _listens("127.0.0.1", data), process, log)
             at = f"http://127.0.0.1:{page}?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A{data}%2Fproxy"
@@ -56,9 +53,6 @@ def serve(folder_or_rrd: Path) -> int:
             return process.wait()
         except KeyboardInterrupt:
             return 0
-        finally:
-            process.terminate()
-            process.wait()
 
 
 def new_viewer() -> str:
@@ -66,7 +60,7 @@ def new_viewer() -> str:
     _refuse_without_screen("wanted --live HOST:PORT of a viewer elsewhere")
     port = _free_port()
     with tempfile.TemporaryFile() as log:
-        process = _started([_program(), "--port", str(port)], log)
+        process = _started(["--port", str(port)], log)
         _wait_for(lambda: _listens("127.0.0.1", port), process, log)
     return viewer_url("127.0.0.1", port)
 
@@ -118,15 +112,13 @@ def picture_time_s(recording: Path, wanted_s: float | None) -> float:
     return wanted_s
 
 
-def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
+def screenshot(recording: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
     """Write a picture of the recording at a scenario time; returns the problems that the viewer's views report.
 
-    Raises InputError if there is no finished recording, or if the viewer does not start: it needs a Vulkan driver, but
-    no screen.
+    Raises InputError if the viewer reads no flight, or if it does not start: it needs a Vulkan driver, but no screen.
     """
     from gcs.views.recording import TIMELINE
 
-    recording = find_recording(folder_or_rrd)
     with _headless(width, height) as viewer:
         viewer.open(str(recording.resolve()))
         try:
@@ -168,13 +160,20 @@ def _headless(width: int, height: int) -> Generator[Any]:
     """Run a viewer without a window, listening on a free local port, and yield its client."""
     if vulkan_missing():
         raise InputError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
-    command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
     from gcs.views.recording import viewer_client
 
+    options = "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"
+    with _running("--headless", *options) as (process, log):
+        yield viewer_client(_address(process, log))
+
+
+@contextmanager
+def _running(*arguments: str) -> Generator[tuple[subprocess.Popen[bytes], IO[bytes]]]:
+    """Run the viewer while entered, and yield it with the file of its output."""
     with raised(), tempfile.TemporaryFile() as log:
-        process = _started(command, log)
+        process = _started(arguments, log)
         try:
-            yield viewer_client(_address(process, log))
+            yield process, log
         finally:
             process.terminate()
             process.wait()
@@ -189,7 +188,8 @@ def _settled_picture(viewer: Any) -> bytes:
     return pictures[-1]
 
 
-def _started(command: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+def _started(arguments: Sequence[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    command = [_program(), *arguments]
     environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as set by the package itself when it starts a viewer
     return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
 

@@ -13,7 +13,7 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_design, read_ticks, write_design
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.record import DESIGN_FILE, RECORDING_FILE, SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.views.observer import record_run
@@ -115,7 +115,7 @@ def test_the_headless_viewer_opens_a_flight_without_view_errors(run: Path) -> No
     pictures: list[Any] = []
     for time_s in (0.2, 3.5):
         png = run / f"{time_s}.png"
-        assert screenshot(run, png, time_s=time_s, width=800, height=500) == []
+        assert screenshot(run / RECORDING_FILE, png, time_s=time_s, width=800, height=500) == []
         pictures.append(imread(png))
     assert [picture.shape[:2] for picture in pictures] == [(500, 800)] * 2
     assert len(np.unique(pictures[0].reshape(-1, pictures[0].shape[2]), axis=0)) > 100  # lines, labels, vehicles

@@ -126,7 +126,7 @@ def test_without_a_screen_the_viewer_is_not_started(tmp_path: Path, monkeypatch:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(InputError, match="no screen here"):
-        view(tmp_path)
+        view(tmp_path / RECORDING_FILE)
 
 
 def test_a_change_of_mode_is_one_entry_of_its_vehicle(tmp_path: Path) -> None:
