@@ -17,7 +17,7 @@ from gcs.drive.flown import Flight, effective_delays_s
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.plan.expected_delay import DrawnDelays, planned_loop_delays_s
 from gcs.plan.flight_plan import FlightPlan, Responses
-from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.grade import first_ns, true_loop_delays_s
 from gcs.station.station import Station
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import ACTED, MemoryRecorder
@@ -104,9 +104,8 @@ def _delays(flight: Flight) -> dict[int, DrawnDelays]:
     """The true delays in a flight of the vehicles with at least two commands that acted."""
     ticks, truth = flight.ticks, flight.truth
     assert truth is not None
-    acted = instants(truth, ACTED)
+    acted_ns = first_ns(truth, ACTED, ticks, "key_ms")
     loop_s = true_loop_delays_s(ticks, truth) - ticks["repeated_s"]
-    acted_ns = np.array([acted.get(key, np.nan) for key in ticks[["system_id", "key_ms"]].tolist()])
     down_s = (acted_ns - ticks["sent_ns"]) / NS_PER_S
     found = dict[int, DrawnDelays]()
     for own in np.unique(ticks["system_id"]).tolist():

@@ -23,7 +23,7 @@ from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED
 Truth = NDArray[np.void]
 """Records of dtype sim_vehicles.links.truth.DTYPE."""
 
-_TIMESYNC, _NEVER = 111, -1
+_TIMESYNC, NEVER = 111, -1
 
 
 class Graded(Published):
@@ -82,7 +82,7 @@ def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray
     Both lists are in order of time and each reply is matched once: of several replies between two ticks, the later ones
     are logged by later ticks.
     """
-    rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+    rows = ticks[np.isfinite(ticks["rtt_s"])]
     due_ns, trip_s = true_round_trips(truth, system_id)
     left = np.searchsorted(due_ns, rows["sent_ns"])
     errors_s: list[float] = []
@@ -122,14 +122,10 @@ def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
 
     NaN where the set-point never acted, or its state is unknown. Each tick must have a row for every vehicle.
     """
-    sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
-    states = ticks[["system_id", "sample_boot_ms"]][_rows_used(ticks)].tolist()
-    set_points = ticks[["system_id", "key_ms"]].tolist()
-    delays_s = [
-        (acted.get(command, np.nan) - sampled.get(state, np.nan)) * 1e-9
-        for command, state in zip(set_points, states, strict=True)
-    ]
-    return np.where(ticks["commanded"], delays_s, np.nan)
+    acted_ns = first_ns(truth, ACTED, ticks, "key_ms")
+    sampled_ns = first_ns(truth, SAMPLED, ticks[_rows_used(ticks)], "sample_boot_ms")
+    known = ticks["commanded"] & (acted_ns != NEVER) & (sampled_ns != NEVER)
+    return np.where(known, (acted_ns - sampled_ns) * 1e-9, np.nan)
 
 
 def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
@@ -149,10 +145,18 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
     return (np.arange(len(age_s))[:, np.newaxis] * vehicles + nearest).ravel()
 
 
-def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
-    """The first instant (ns) recorded for each (system id, time_boot_ms) in the records of a kind."""
-    own = truth[truth["kind"] == kind][::-1]  # reversed: the first of several records is then kept
-    return {(system_id, key): time_ns for system_id, key, time_ns in own[["system_id", "key", "time_ns"]].tolist()}
+def first_ns(truth: Truth, kind: int, rows: TickArray, column: str) -> IntArray:
+    """For each row, the first instant that a kind of record has for its vehicle and time_boot_ms; NEVER if none."""
+    of_kind = truth[truth["kind"] == kind]
+    known, first = np.unique(_keys(of_kind, "key"), return_index=True)
+    keys = _keys(rows, column)
+    place = np.searchsorted(known, keys)
+    found_ns = np.append(of_kind["time_ns"][first], NEVER)
+    return found_ns[np.where(np.append(known, -1)[place] == keys, place, -1)]
+
+
+def _keys(records: Truth, column: str) -> IntArray:
+    return records["system_id"].astype(np.int64) << 32 | records[column]
 
 
 def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
@@ -168,22 +172,11 @@ def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
 
 def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
     """When a vehicle's commands acted and when the states behind them were sampled: (k, 2), ns, in order of time."""
-    own, of_truth = (ticks["system_id"] == system_id) & ticks["commanded"], truth["system_id"] == system_id
-    acted_ns, sampled_ns = (
-        _first_ns(truth, of_truth & (truth["kind"] == kind), ticks[name][own])
-        for kind, name in ((ACTED, "key_ms"), (SAMPLED, "sample_boot_ms"))
-    )
-    known = (acted_ns != _NEVER) & (sampled_ns != _NEVER)
+    own, truth = ticks[(ticks["system_id"] == system_id) & ticks["commanded"]], truth[truth["system_id"] == system_id]
+    acted_ns, sampled_ns = first_ns(truth, ACTED, own, "key_ms"), first_ns(truth, SAMPLED, own, "sample_boot_ms")
+    known = (acted_ns != NEVER) & (sampled_ns != NEVER)
     pairs = np.stack([acted_ns, sampled_ns], axis=1)[known]
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-
-
-def _first_ns(truth: Truth, which: NDArray[np.bool_], keys: IntArray) -> IntArray:
-    """For each key, the instant (ns) of the first record in `which` that has it; _NEVER where there is none."""
-    known, first = np.unique(truth["key"][which], return_index=True)
-    found_ns = np.append(truth["time_ns"][which][first], _NEVER)
-    place = np.searchsorted(known, keys)
-    return found_ns[np.where(np.append(known, -1)[place] == keys, place, -1)]
 
 
 def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
@@ -191,8 +184,8 @@ def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray
 
     Each tick must have a row for every vehicle.
     """
-    acted, delays_s = instants(truth, ACTED), true_loop_delays_s(ticks, truth)
+    delays_s = true_loop_delays_s(ticks, truth)
     own = (ticks["system_id"] == system_id) & np.isfinite(delays_s)
-    acted_ns = [acted[system_id, key] for key in ticks["key_ms"][own].tolist()]
+    acted_ns = first_ns(truth, ACTED, ticks[own], "key_ms").tolist()
     pairs = [(at, at - round(1e9 * late_s)) for at, late_s in zip(acted_ns, delays_s[own].tolist(), strict=True)]
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)

@@ -14,12 +14,13 @@ import numpy as np
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import CLOCK_JUMPED, Mode
 from gcs.drive.flown import margins_of
-from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.grade import true_loop_delays_s
 from gcs.runs.summary import summarise
 from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 from sim_vehicles.links.truth import ACTED, SAMPLED
 from tests.soak.soak_flight import Flown, Stretch
+from tests.support.truth import instants
 
 ALWAYS = ("time_s", "due_ns", "sent_ns")
 WHEN_COMMANDED = (

@@ -19,7 +19,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import plan_loops
 from gcs.plan.onboard import own_parameters
 from gcs.plan.planner import flight_plan
-from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.grade import true_loop_delays_s
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from gcs.stress.axes import at_coordinates
@@ -37,6 +37,7 @@ from sim_vehicles.links.truth import ACTED, SAMPLED, MemoryRecorder
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
+from tests.support.truth import instants
 
 THESIS = SCENARIOS / "thesis_delay.toml"
 

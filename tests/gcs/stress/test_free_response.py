@@ -13,7 +13,7 @@ from gains.sampled.coupled_block import CoupledBlock
 from gains.sampled.multirate import effective_delay_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.loops import plan_loops
-from gcs.runs.grade import ACTED, SAMPLED, commands_of, instants
+from gcs.runs.grade import ACTED, SAMPLED, commands_of
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, in_place, response_paired
 from gcs.stress.growth import CHANNELS
@@ -23,6 +23,7 @@ from scenarios.keys.disturbance import Disturbance, Gusts, Navigation
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Limits
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan
+from tests.support.truth import instants
 
 PERIOD_S = 0.02
 
