@@ -134,11 +134,12 @@ def bench(
         links = scenario.links.model_copy(update={"one_port": True})
         scenario = scenario.model_copy(update={"links": links})
     options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
+    if peers or cluster:
+        options.refuse(scenario_file, benchmark.first_unsupported_key(scenario))
     if peers:
         from gcs.studies.peers import SIZES, side_by_side
         from gcs.views.console import progress
 
-        options.refuse(scenario_file, benchmark.first_unsupported_key(scenario))
         sizes = (vehicles,) if vehicles else SIZES
         with progress(shown=not as_json) as begin:
             table = side_by_side(scenario, seconds=seconds, sizes=sizes, ended=begin("peers"))
@@ -146,7 +147,6 @@ def bench(
     elif cluster:
         from gcs.studies.cluster import map_on_cluster
 
-        options.refuse(scenario_file, benchmark.first_unsupported_key(scenario))
         at_once = workers or len(os.sched_getaffinity(0))
         found = map_on_cluster(scenario, trials=cluster, workers=at_once, seconds=seconds)
         options.answer(found, print_cluster, as_json=as_json)
