@@ -311,7 +311,6 @@ def _campaign(
 ) -> "tuple[CampaignResult, Path]":
     """Fly the sweep over the axes and, with a tolerance, search for the onset; returns the result and its folder."""
     from gcs.drive.fly import new_folder
-    from gcs.plan.loops import window_of
     from gcs.runs.files import write_scenario
     from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
@@ -341,8 +340,7 @@ def _campaign(
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
                 onset = _onset_or_why(study, run, tolerance=tolerance, vehicle=vehicle)
-                begins_s, _ = study.window_s if vehicle is None else window_of(study.plan, vehicle)
-                if not isinstance(onset, NoOnset) and begins_s > 0.0:
+                if not isinstance(onset, NoOnset) and study.window_of(vehicle)[0] > 0.0:
                     onset_shorter = _onset_or_why(study, run, tolerance=tolerance, shorter=True, vehicle=vehicle)
         except KeyboardInterrupt:
             typer.echo(store.resume, err=True)

@@ -48,6 +48,10 @@ class Study:
         assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
 
+    def window_of(self, vehicle: int | None) -> Window:
+        """The range of loop delays if only the link of `vehicle` is slowed; None slows all links, as `window_s`."""
+        return self.window_s if vehicle is None else window_of(self.plan, vehicle)
+
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
         """The trial at one point. `seed` is that of its scenario, from which clocks, jitter and loss are drawn."""
         scenario = at_coordinates(self.plan.scenario, coordinates).model_copy(update={"seed": seed})
@@ -142,7 +146,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
     `vehicle` is given, its link alone is slowed, else all links alike. Raises NoOnset with the reason.
     """
     slowed = _Slowed(study, vehicle)
-    expected_s, way = slowed.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
+    expected_s, way = study.window_of(vehicle)[0 if shorter else 1], -1.0 if shorter else 1.0
     if vehicle is not None and (unstable := unstable_over_links(study.plan, but=vehicle)):
         who = f"vehicle{'s' * (len(unstable) > 1)} {' '.join(map(str, unstable))}"
         raise NoOnset(f"the links of the scenario alone make {who} unstable, by prediction")
@@ -234,10 +238,6 @@ class _Slowed:
 
     study: Study
     vehicle: int | None
-
-    @property
-    def window_s(self) -> Window:
-        return self.study.window_s if self.vehicle is None else window_of(self.study.plan, self.vehicle)
 
     def at(self, link_s: float) -> dict[str, float]:
         """The coordinates of a link delay, up plus down."""
