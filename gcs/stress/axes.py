@@ -16,6 +16,7 @@ import numpy as np
 from gcs.errors import InputError
 from scenarios.keys.link import Jitter, Link, VehicleLinks
 from scenarios.keys.part import PREDICTION_MAX_S
+from scenarios.link_files import each_link
 from scenarios.schema import Scenario
 
 
@@ -113,13 +114,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
 
 def has_constant_links(scenario: Scenario) -> bool:
     """Whether every link has only a constant delay, so that the models describe it exactly."""
-    return all(link == Link(delay_s=link.delay_s) for link in every_link(scenario))
-
-
-def every_link(scenario: Scenario) -> list[Link]:
-    """The scenario's default links, and those of single vehicles."""
-    links = scenario.links
-    return [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link is not None)]
+    return all(link == Link(delay_s=link.delay_s) for _, link in each_link(scenario.links))
 
 
 def place_text(coordinates: Mapping[str, float]) -> str:

@@ -19,11 +19,12 @@ from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gains.varying.predicted import PredictedSpread
 from gcs.plan.loops import plan_loops
-from gcs.stress.axes import PREDICTION, Axis, at_coordinates, every_link
+from gcs.stress.axes import PREDICTION, Axis, at_coordinates
 from gcs.stress.figures import MEASURED
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome
 from gcs.views.page import figure_of, saved
+from scenarios.link_files import each_link
 
 _PREDICTED, _GUARANTEED, _SEVERAL, _BLANK = "black", "#1b7837", "#7b3294", "#c8c8c8"
 _POINTS = 60
@@ -120,7 +121,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     scenario, names = study.plan.scenario, [axis.name for axis in axes]
     if names != ["delay", "jitter"] or len(axes[0].values) < 2 or study.plan.onboard is not None:
         return None
-    jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
+    jittery = [link for _, link in each_link(at_coordinates(scenario, {"jitter": 1.0}).links)]
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
         return None
     delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
