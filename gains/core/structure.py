@@ -7,11 +7,9 @@ nonzero entries are the diagonal blocks of the triangular form. The spectrum, wi
 their spectra, so each block is analysed on its own, and equal blocks only once.
 """
 
-import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from graphlib import TopologicalSorter
 from math import inf, log2
 from numbers import Real
 from sys import float_info
@@ -121,9 +119,8 @@ def shown(value: object) -> str:
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     """Index sets of the strongly connected components of the union of the patterns of square matrices.
 
-    State j drives state i if the entry (i, j) of any matrix is not exactly zero. Sets are ordered with drivers first,
-    ties by lowest index: in this order of states every matrix is block lower triangular. Indices within a set
-    ascend.
+    State j drives state i if the entry (i, j) of any matrix is not exactly zero. Sets are ordered with drivers first:
+    in this order of states every matrix is block lower triangular. Indices within a set ascend.
 
     x_1 and x_2 drive each other, x_0 drives x_1:
 
@@ -146,13 +143,8 @@ def _blocks_of_pattern(size: int, content: bytes) -> list[IntArray]:
         return [np.arange(len(pattern))]
     driven, driver = np.nonzero(pattern)
     label = _components(len(pattern), driven, driver)
-    if not label.any():
-        return [np.arange(label.size)]
     order = np.argsort(label, kind="stable")
-    members = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    across = label[driver] != label[driven]
-    edges = set(zip(label[driver[across]].tolist(), label[driven[across]].tolist(), strict=True))
-    return [members[k] for k in _drivers_first([int(block[0]) for block in members], edges)]
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def distinct_blocks(*matrices: RealArray) -> list[Block]:
@@ -296,6 +288,8 @@ def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
 def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
     """Label of the strongly connected component of each state, from edges in ascending order of the driven state.
 
+    Labels count from 0, drivers first: the search goes from a state to its drivers and labels what it has left.
+
     R. Tarjan, "Depth-first search and linear graph algorithms", SIAM J. Comput. 1 (1972), 146-160, without recursion.
     """
     ends = np.cumsum(np.bincount(driven, minlength=size)).tolist()
@@ -327,19 +321,3 @@ def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
                     label[unlabelled.pop()] = found
                 found += 1
     return np.array(label)
-
-
-def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:
-    """Topological order of components, ties by lowest state index."""
-    sorter = TopologicalSorter[int](dict.fromkeys(range(len(lowest_index)), ()))
-    for driver, driven in edges:
-        sorter.add(driven, driver)
-    sorter.prepare()
-    ready: list[tuple[int, int]] = []
-    order: list[int] = []
-    while sorter.is_active():
-        for k in sorter.get_ready():
-            heapq.heappush(ready, (lowest_index[k], k))
-        order.append(heapq.heappop(ready)[1])
-        sorter.done(order[-1])
-    return order
