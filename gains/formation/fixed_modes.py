@@ -43,11 +43,11 @@ class FixedMode:
         return self.mode.real > -1e-9 * max(1.0, abs(self.mode))
 
 
-def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
+def fixed_modes(plant: Plant, pattern: Pattern) -> tuple[FixedMode, ...]:
     """Every mode that no gain with the pattern moves, in ascending order of real part.
 
-    The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` seeds the
-    random gains. Raises BadModelError if plant and pattern do not fit.
+    The position of a formation's leader is not a state of its error model and therefore no fixed mode. Raises
+    BadModelError if plant and pattern do not fit.
 
     The integrator of a leader that may not use its own velocity error is fixed, unless a link is added:
 
@@ -60,7 +60,7 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     (True, (0,), (((0, 0),), ((0, 1),)))
     """
     check_fits(plant, pattern)
-    gains = _random_gains(plant, pattern, seed)
+    gains = _random_gains(plant, pattern)
     feedbacks = [plant.B @ gain @ plant.C for gain in gains]
     linked = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
     found: dict[complex, set[int]] = {}
@@ -75,21 +75,19 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     )
 
 
-def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
-    """The fixed modes, if all of them are stable.
+def check_stabilisable(plant: Plant, pattern: Pattern) -> None:
+    """Raise InfeasibleError if a fixed mode is unstable; the message names the links to add.
 
-    A dynamic controller with the pattern then stabilises the plant; a static gain need not exist. Raises
-    InfeasibleError if a fixed mode is unstable; the message names the links to add. Otherwise as `fixed_modes`.
+    If all are stable, a dynamic controller with the pattern stabilises the plant; a static gain need not exist. Raises
+    BadModelError as `fixed_modes` does.
     """
-    modes = fixed_modes(plant, pattern, seed=seed)
-    unstable = [mode for mode in modes if mode.unstable]
+    unstable = [mode for mode in fixed_modes(plant, pattern) if mode.unstable]
     if unstable:
         worst = max(unstable, key=lambda mode: mode.mode.real)
         raise InfeasibleError(
             f"no gain with this pattern moves the mode {_number(worst.mode)} 1/s (states {list(worst.states)}): "
             f"{_advice(worst.remedies)}"
         )
-    return modes
 
 
 def distinct_modes(A: FloatArray) -> list[complex]:
@@ -118,9 +116,9 @@ def _is_eigenvalue(matrix: FloatArray, mode: complex) -> bool:
     return float(singular[-1]) <= _RANK_TOLERANCE * float(np.linalg.norm(matrix, 2))
 
 
-def _random_gains(plant: Plant, pattern: Pattern, seed: int) -> list[FloatArray]:
+def _random_gains(plant: Plant, pattern: Pattern) -> list[FloatArray]:
     """Random gains with the pattern, scaled to move modes by about the distance between the plant's own modes."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     scale = _size(plant.A) / (_size(plant.B) * _size(plant.C))
     mask = pattern.mask
     # magnitudes between 0.5 and 1.5: an entry close to 0 would barely count as a link
