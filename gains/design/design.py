@@ -25,7 +25,7 @@ from gains.design.for_delay import criteria_gains
 from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
 from gains.design.search import largest_alpha
-from gains.formation.model import FormationModel, checked_gain
+from gains.formation.model import FormationModel, checked_gains
 from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
 from gains.performance.behaviour import Behaviour, BlockMargin, behaviour, block_margin, diagonal_blocks
 from gains.performance.robust import Certificate, certify, robustness
@@ -204,9 +204,7 @@ def evaluate_gains(
         K1, K2, K3 = gains
     except (TypeError, ValueError) as error:
         raise BadModelError(f"gains is {shown(gains)}; K1, K2 and K3 are wanted") from error
-    own, front, spacing = (
-        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
-    )
+    own, front, spacing = checked_gains(K1, K2, K3, formation.axes)
     return _assess(formation, (own, front, spacing), feed_forward, period_s=period_s, requirement=None)
 
 

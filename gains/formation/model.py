@@ -132,9 +132,7 @@ class FormationModel:
         the spacing error. In a stable loop K1 is negative and K3 positive (definite), because e_i^p grows as vehicle i
         falls behind. BadModelError unless each is a finite matrix of shape (axes, axes).
         """
-        own, front, spacing = (
-            checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
-        )
+        own, front, spacing = checked_gains(K1, K2, K3, self.axes)
         K = np.zeros((self.inputs, self.states))
         for i in range(self.vehicles):
             K[self.input_slice(i), self.velocity_slice(i)] = own
@@ -176,12 +174,13 @@ class FormationModel:
         return vehicle
 
 
-def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
-    """The gain as a finite array of shape (axes, axes); BadModelError names it otherwise."""
-    array = real_matrix(name, gain)
-    if array.shape != (axes, axes):
-        raise BadModelError(f"{name} has shape {array.shape}; wanted ({axes}, {axes})")
-    return array
+def checked_gains(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, axes: int) -> list[FloatArray]:
+    """The gains as finite arrays of shape (axes, axes); BadModelError names one that is not."""
+    gains = {name: real_matrix(name, gain) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))}
+    for name, gain in gains.items():
+        if gain.shape != (axes, axes):
+            raise BadModelError(f"{name} has shape {gain.shape}; wanted ({axes}, {axes})")
+    return [*gains.values()]
 
 
 def _checked_predecessors(predecessors: ArrayLike) -> tuple[int, ...]:

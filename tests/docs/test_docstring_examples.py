@@ -55,7 +55,7 @@ INTERNAL_FUNCTIONS = {
     "gains.design.time_scale.scaled_to",
     "gains.formation.bipartite.smallest_partition",
     "gains.formation.fixed_modes.check_stabilisable",
-    "gains.formation.model.checked_gain",
+    "gains.formation.model.checked_gains",
     "gains.formation.pattern.check_fits",
     "gains.formation.pattern.checked_pattern_gain",
     "gains.margin.loop_margin.fixed_note",
