@@ -37,11 +37,8 @@ class Subgraph:
         return tuple((i, j) for i in self.inputs for j in self.outputs)
 
 
-@dataclass(frozen=True)
-class Partition:
-    """Subgraphs, sorted by their first link, that together hold every link of a pattern exactly once."""
-
-    subgraphs: tuple[Subgraph, ...]
+Partition = tuple[Subgraph, ...]
+"""Subgraphs, sorted by their first link, that together hold every link of a pattern exactly once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,14 +67,15 @@ class ExpandedGain:
 def partition_by_input(pattern: Pattern) -> Partition:
     """The partition with one subgraph for each input and the outputs it uses: φ1 = I if every input uses an output.
 
-    The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
+    A partition is a tuple of `Subgraph`, sorted by their first link. The pattern (4.6) gives {K11}, {K21, K22},
+    {K32, K33}.
 
     >>> from gains import FormationModel
     >>> from gains.formation.pattern import leader_follower
-    >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
+    >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1))))]
     [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
-    return Partition(tuple(_rows(pattern.blocks)))
+    return tuple(_rows(pattern.blocks))
 
 
 def smallest_partition(pattern: Pattern) -> Partition:
@@ -107,7 +105,7 @@ def smallest_partition(pattern: Pattern) -> Partition:
         )
         for graph in best
     ]
-    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)))
+    return tuple(sorted(copied, key=lambda graph: graph.links))
 
 
 def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
@@ -123,11 +121,10 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     ((6, 16), (16, 10), True)
     """
     _check_partition(pattern, partition)
-    graphs = partition.subgraphs
-    phi1 = _stacked([i for graph in graphs for i in graph.inputs], pattern.input_sizes).T
-    phi2 = _stacked([j for graph in graphs for j in graph.outputs], pattern.output_sizes)
-    rows = [k for k, graph in enumerate(graphs) for i in graph.inputs for _ in range(pattern.input_sizes[i])]
-    columns = [k for k, graph in enumerate(graphs) for j in graph.outputs for _ in range(pattern.output_sizes[j])]
+    phi1 = _stacked([i for graph in partition for i in graph.inputs], pattern.input_sizes).T
+    phi2 = _stacked([j for graph in partition for j in graph.outputs], pattern.output_sizes)
+    rows = [k for k, graph in enumerate(partition) for i in graph.inputs for _ in range(pattern.input_sizes[i])]
+    columns = [k for k, graph in enumerate(partition) for j in graph.outputs for _ in range(pattern.output_sizes[j])]
     return ExpandedGain(pattern, phi1, phi2, np.equal.outer(rows, columns))
 
 
@@ -155,7 +152,7 @@ def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> floa
 
 
 def _check_partition(pattern: Pattern, partition: Partition) -> None:
-    links = [link for graph in partition.subgraphs for link in graph.links]
+    links = [link for graph in partition for link in graph.links]
     twice = sorted({link for link in links if links.count(link) > 1}) if len(set(links)) < len(links) else []
     if twice:
         raise BadModelError(f"link {twice[0]} is in more than one subgraph; exactly one is wanted")

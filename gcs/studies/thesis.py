@@ -208,7 +208,7 @@ def _graph() -> Iterator[Claim]:
     rows, columns = expanded.mask.shape
     yield Claim(
         "(4.6), (4.7)", "partition by input", "{K11}, {K21, K22}, {K32, K33}; K̄ 6×16, φ2 16×10",
-        f"{len(partition.subgraphs)} subgraphs; K̄ {rows}×{columns}, φ2 {columns}×{expanded.phi2.shape[1]}",
+        f"{len(partition)} subgraphs; K̄ {rows}×{columns}, φ2 {columns}×{expanded.phi2.shape[1]}",
         f"closed-loop modes differ by {verify_expansion(plant, expanded, K):.0e} from those of K", "agrees",
     )  # fmt: skip
     # of PA + A'P + αI at P = I, K = 0

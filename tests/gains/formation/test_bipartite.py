@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import arrays
 from gains.core.errors import BadModelError, DisagreementError
 from gains.formation.bipartite import (
     LARGEST_SEARCH_LINKS,
-    Partition,
     Subgraph,
     expanded_gain,
     partition_by_input,
@@ -40,7 +39,7 @@ def pattern_of(blocks: np.ndarray) -> Pattern:
 
 def size_and_rank(pattern: Pattern) -> tuple[int, int]:
     """The size of the partition found, and the rank of the pattern, which bounds that of every partition from below."""
-    return len(smallest_partition(pattern).subgraphs), int(np.linalg.matrix_rank(pattern.blocks.astype(float)))
+    return len(smallest_partition(pattern)), int(np.linalg.matrix_rank(pattern.blocks.astype(float)))
 
 
 def fewest_by_brute_force(blocks: np.ndarray) -> int:
@@ -70,7 +69,7 @@ def test_leader_follower_pattern_by_input_is_that_of_the_source() -> None:
     # (4.6), (4.7): {K11}, {K21, K22}, {K32, K33}; K̄ is 6×16, φ2 is 16×10 and stacks x1, x1, x2, x2, x3
     partition = partition_by_input(leader_follower(CHAIN))
     expanded = expanded_gain(leader_follower(CHAIN), partition)
-    assert [graph.links for graph in partition.subgraphs] == [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
+    assert [graph.links for graph in partition] == [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     assert expanded.mask.shape == (6, 16)
     assert np.array_equal(expanded.phi1, np.eye(6))
     x1, x2, x3 = np.split(np.arange(10.0), [2, 6])
@@ -81,30 +80,30 @@ def test_no_partition_of_a_chain_is_smaller_than_by_input() -> None:
     for formation in (CHAIN, FormationModel((-1, *range(59)))):
         pattern = leader_follower(formation)
         assert size_and_rank(pattern) == (formation.vehicles, formation.vehicles)
-        assert len(partition_by_input(pattern).subgraphs) == formation.vehicles
+        assert len(partition_by_input(pattern)) == formation.vehicles
 
 
 def test_a_smaller_partition_is_found_where_it_exists() -> None:
     # vehicles 1, 2 and 3 use the same two outputs: one subgraph in place of three
     blocks = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 0], [1, 1, 0], [0, 0, 1]])
     partition = smallest_partition(pattern_of(blocks))
-    assert len(partition_by_input(pattern_of(blocks)).subgraphs) == 5
-    assert len(partition.subgraphs) == 3
-    assert smallest_partition(all_to_all(CHAIN)).subgraphs == (Subgraph((0, 1, 2), (0, 1, 2)),)
+    assert len(partition_by_input(pattern_of(blocks))) == 5
+    assert len(partition) == 3
+    assert smallest_partition(all_to_all(CHAIN)) == (Subgraph((0, 1, 2), (0, 1, 2)),)
 
 
 @settings(deadline=None)
 @given(small_blocks)
 def test_partition_is_the_smallest_of_all(blocks: np.ndarray) -> None:
     partition = smallest_partition(pattern_of(blocks))
-    assert len(partition.subgraphs) == fewest_by_brute_force(blocks)
+    assert len(partition) == fewest_by_brute_force(blocks)
 
 
 @settings(deadline=None, max_examples=25)
 @given(arrays(np.bool_, (9, 9)))
 def test_every_link_is_in_exactly_one_subgraph(blocks: np.ndarray) -> None:
     for partition in (partition_by_input(pattern_of(blocks)), smallest_partition(pattern_of(blocks))):
-        links = sorted(link for graph in partition.subgraphs for link in graph.links)
+        links = sorted(link for graph in partition for link in graph.links)
         assert links == list(pattern_of(blocks).links)
 
 
@@ -133,7 +132,7 @@ def test_expanding_and_contracting_gives_the_gain_back(blocks: np.ndarray, seed:
     n = 5
     plant = Plant(*(rng.standard_normal(shape) for shape in ((n, n), (n, pattern.inputs), (pattern.outputs, n))))
     for partition in (partition_by_input(pattern), smallest_partition(pattern)):
-        if not partition.subgraphs:
+        if not partition:
             continue
         expanded = expanded_gain(pattern, partition)
         assert np.array_equal(expanded.phi1 @ expanded.expand(K) @ expanded.phi2, K)
@@ -153,14 +152,14 @@ def test_modes_of_the_expanded_loop_are_those_of_the_formation() -> None:
 
 def test_partitions_that_do_not_fit_are_refused_with_the_link() -> None:
     pattern = leader_follower(CHAIN)
-    graphs = partition_by_input(pattern).subgraphs
+    graphs = partition_by_input(pattern)
     for subgraphs, message in (
         (graphs[:2], r"link \(2, 1\) is not in any subgraph"),
         ((*graphs, Subgraph((0,), (1,))), r"link \(0, 1\) is not in the pattern"),
         ((*graphs, Subgraph((2,), (2,))), r"link \(2, 2\) is in more than one"),
     ):
         with pytest.raises(BadModelError, match=message):
-            expanded_gain(pattern, Partition(subgraphs))
+            expanded_gain(pattern, subgraphs)
 
 
 def test_loops_that_differ_are_refused() -> None:
