@@ -22,6 +22,7 @@ T = TypeVar("T")
 START_S = 20.0
 SETTLE_S = 20.0
 DEFAULT_PICTURE_S = 10.0
+_PICTURE_SIZE = "1600x900"
 _MAGIC = b"RRF"
 """The first bytes of every .rrd file."""
 _WANTED = "wanted a recording of a run (.rrd)"
@@ -112,14 +113,14 @@ def picture_time_s(recording: Path, wanted_s: float | None) -> float:
     return wanted_s
 
 
-def screenshot(recording: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
+def screenshot(recording: Path, png: Path, *, time_s: float) -> list[str]:
     """Write a picture of the recording at a scenario time; returns the problems that the viewer's views report.
 
     Raises InputError if the viewer reads no flight, or if it does not start: it needs a Vulkan driver, but no screen.
     """
     from gcs.views.recording import TIMELINE
 
-    with _headless(width, height) as viewer:
+    with _headless() as viewer:
         viewer.open(str(recording.resolve()))
         try:
             viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
@@ -156,13 +157,13 @@ def vulkan_missing() -> bool:
 
 
 @contextmanager
-def _headless(width: int, height: int) -> Generator[Any]:
+def _headless() -> Generator[Any]:
     """Run a viewer without a window, listening on a free local port, and yield its client."""
     if vulkan_missing():
         raise InputError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
     from gcs.views.recording import viewer_client
 
-    options = "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"
+    options = "--bind", "127.0.0.1", "--port", "0", "--window-size", _PICTURE_SIZE
     with _running("--headless", *options) as (process, log):
         yield viewer_client(_address(process, log))
 

@@ -115,9 +115,9 @@ def test_the_headless_viewer_opens_a_flight_without_view_errors(run: Path) -> No
     pictures: list[Any] = []
     for time_s in (0.2, 3.5):
         png = run / f"{time_s}.png"
-        assert screenshot(run / RECORDING_FILE, png, time_s=time_s, width=800, height=500) == []
+        assert screenshot(run / RECORDING_FILE, png, time_s=time_s) == []
         pictures.append(imread(png))
-    assert [picture.shape[:2] for picture in pictures] == [(500, 800)] * 2
+    assert [picture.shape[:2] for picture in pictures] == [(900, 1600)] * 2
     assert len(np.unique(pictures[0].reshape(-1, pictures[0].shape[2]), axis=0)) > 100  # lines, labels, vehicles
     moved = np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.1
     assert 0.001 < moved.mean() < 0.9  # vehicles and the time cursor have moved on, the screen is the same
@@ -128,4 +128,4 @@ def test_a_recording_without_any_tick_is_reported_in_one_line(run: Path, tmp_pat
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
     with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it, wanted a recording of a run"):
-        screenshot(cut, tmp_path / "cut.png", time_s=0.0, width=800, height=500)
+        screenshot(cut, tmp_path / "cut.png", time_s=0.0)
