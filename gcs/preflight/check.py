@@ -100,7 +100,8 @@ class ScenarioCheck(Published):
     """The longest link outage during the flight, which no figure here includes; None without outages."""
     setpoint_gaps: float
     """Expected number of gaps between set-points, over all vehicles and the whole flight, that exceed
-    `safety.setpoint_timeout_s` and so put a vehicle into failsafe. Outages are not counted."""
+    `safety.setpoint_timeout_s` and so put a vehicle into failsafe. A gap just as long counts as half. Outages are not
+    counted."""
     delay_margin_s: float | None
     """None if no delay makes the loop unstable; with prediction, the upper end of the mismatch window."""
     assumed_delay_s: float | None

@@ -5,7 +5,12 @@ import pytest
 
 from gcs import fly_virtual
 from gcs.drive.flown import fly_plan
-from gcs.plan.expected_delay import effective_loop_delays_s, expected_loop_delay_s, planned_loop_delays_s
+from gcs.plan.expected_delay import (
+    effective_loop_delays_s,
+    expected_loop_delay_s,
+    planned_loop_delays_s,
+    setpoint_gaps,
+)
 from gcs.plan.planner import flight_plan
 from gcs.preflight.check import check
 from gcs.stress.free_response import effective_delays_s
@@ -172,6 +177,17 @@ def test_failsafes_are_expected_where_set_points_stay_away() -> None:
     # one for each run of two or more lost set-points
     assert check(flight_plan(scenario)[1]).setpoint_gaps == pytest.approx(3 * 60.0 * 5.0 * 0.5**3, rel=0.1)
     assert len(events) > 0
+
+
+def test_gaps_as_long_as_the_timeout_count_half() -> None:
+    """So do gaps that the smallest jitter makes longer or shorter."""
+    jitter = Jitter(distribution="uniform", scale_s=1e-6)
+    constant, shaken = (losing(Link(delay_s=0.02, jitter=own)) for own in (None, jitter))
+    safety = constant.safety.model_copy(update={"setpoint_timeout_s": 1.0 / constant.rates.control_hz})
+    sent = 3 * constant.duration_s * constant.rates.control_hz
+    for scenario in (constant, shaken):
+        expected = setpoint_gaps(scenario.model_copy(update={"safety": safety}))
+        assert expected == pytest.approx(0.5 * sent, rel=0.03)  # 5000 gaps are drawn
 
 
 def test_states_lost_in_bursts_lengthen_the_p99_loop_delay() -> None:
