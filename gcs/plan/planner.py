@@ -156,9 +156,9 @@ def _with_own_margins(design: Design, plan: FlightPlan) -> Design:
 def with_trade_off(design: Design) -> Design:
     """The design with the best α at other delay margins, which takes longer to compute than all its other figures.
 
-    Unchanged for gains on a pattern, and for an unknown margin.
+    Unchanged for gains on a pattern, for one vehicle, whose α is not a follower's, and for an unknown margin.
     """
-    if design.inclusion_gains is None or design.margin_unknown:
+    if design.inclusion_gains is None or design.vehicles == 1 or design.margin_unknown:
         return design
     wanted, fed = design.requirement or Requirement(), design.feed_forward
     points = trade_off(

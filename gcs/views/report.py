@@ -43,19 +43,22 @@ def print_design(design: Design, console: Console | None = None) -> None:
         return
     if design.inclusion_gains is not None and design.behaviour is not None:
         own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-        console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
+        followed = f", K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²" if design.vehicles != 1 else ""
+        console.print(f"gains    K1 {own:+.4f} 1/s{followed}")
         fed = f" + {design.feed_forward:g} u_(i-1)" if design.feed_forward else ""
         law = f"u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p{fed}, the leader u_1 = K1 e_1^v, north and east alike"
-        console.print(f"         {law}")
+        console.print(f"         {law if followed else 'u = K1 e^v, north and east alike'}")
         _print_margins(design, console)
         console.print(response_text(design.response), end="")
-        bound, decay_1_s = "robustness bound", design.behaviour.decay_rate_1_s
+        alpha, bound, decay_1_s = design.alpha, "robustness bound", design.behaviour.decay_rate_1_s
+        if not followed:  # the design's figures are those of a follower; here e' = K1 e + w
+            alpha, decay_1_s = max(0.0, -own), -own
     else:
         console.print(table_of(design.blocks, _BLOCK_COLUMNS))
         _print_margins(design, console)
-        bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
+        bound, alpha, decay_1_s = "robustness bound of the whole formation", design.alpha, design.decay_rate_1_s
     loss = "" if design.cost_loss is None else f"; LQR cost {design.cost_loss:.1%} above the centralised optimum"
-    console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
+    console.print(f"alpha    {alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
     if (whole := design.whole) is not None:

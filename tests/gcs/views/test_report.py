@@ -1,7 +1,10 @@
 """What is said of a flight as a whole."""
 
+import pytest
+
 from gcs import fly_virtual
-from gcs.views.report import flight_lines
+from gcs.plan.planner import flight_plan, with_trade_off
+from gcs.views.report import flight_lines, print_design
 from scenarios.files import load
 from scenarios.keys.link import Link, Links, Outage, VehicleLinks
 from scenarios.schema import Control, FixedGains, Rates
@@ -27,6 +30,19 @@ def test_margins_of_single_vehicles_are_not_mistaken_for_slower_gains() -> None:
     links = Links(up=quick, down=quick, vehicles=(VehicleLinks(system_id=3, up=slow, down=slow),))
     scenario = load(located("chain3_bidirectional")).model_copy(update={"links": links, "duration_s": 5.0})
     assert "; margin 390.0 to 503.7 ms by vehicle; " in flight_lines(fly_virtual(scenario).summary)["delay"]
+
+
+def test_one_vehicle_alone_is_not_given_the_figures_of_a_follower(capsys: pytest.CaptureFixture[str]) -> None:
+    """e' = K1 e + w stays stable for any w smaller than −K1 times e, and decays at −K1."""
+    chain = load(located("chain3"))
+    design = with_trade_off(flight_plan(chain.model_copy(update={"vehicles": chain.leader_first()[:1]}))[0])
+    print_design(design)
+    said = capsys.readouterr().out
+    assert design.K1_1_s is not None
+    own = -design.K1_1_s[0][0]
+    assert f"alpha    {own:.4f} (robustness bound), decay {own:.2f} 1/s" in said
+    assert "K2" not in said
+    assert "trade-off" not in said
 
 
 def test_a_flight_nominal_throughout_says_nothing_of_modes() -> None:
