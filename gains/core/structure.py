@@ -182,14 +182,15 @@ def roots_of(A: FloatArray) -> ComplexArray:
     return np.concatenate([np.linalg.eigvals(block.matrices[0]) for block in blocks]).astype(np.complex128)
 
 
-def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
+def without_fixed_roots(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
     """The matrices without the directions along which nothing ever acts, and the number of states removed.
 
     A consensus loses its common value; a formation at constant velocity loses its position, then its velocity. A
     direction v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root at s = 0 of
     det(sI - A_0 - A_1 e^{-s tau} - ...) at every delay. Such directions are split off by an orthonormal basis, in each
-    strongly connected block, until none is left; all other roots stay. A block with no other motion (an integrator
-    without feedback) stays as it is. BadModelError unless the matrices are square, finite and of one size.
+    strongly connected block, until none is left; all other roots stay. A motion split off after another, such as that
+    velocity, may drive it: the position then grows with time. A block with no other motion (an integrator without
+    feedback) stays as it is. BadModelError unless the matrices are square, finite and of one size.
     """
     checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     moving = [(block.copies, _moving_part(list(block.matrices))) for block in distinct_blocks(*checked)]
@@ -272,7 +273,7 @@ def _projected(matrix: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
-    """The block, balanced, without its equilibria; the block itself if it has nothing else."""
+    """The block, balanced, without its fixed roots; the block itself if it has nothing else."""
     left = list(balanced(*block))
     while left[0].size > 0:
         size = left[0].shape[0]

@@ -30,7 +30,7 @@ def analyse_delay(
     A loop with a root that stays on the imaginary axis at every delay is never asymptotically stable: no window,
     margin 0. If the sum of the matrices is singular, s = 0 is such a root. If it is merely the common value of a
     consensus, set `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove the
-    states on which nothing acts with `gains.core.structure.without_equilibria`.
+    states on which nothing acts with `gains.core.structure.without_fixed_roots`.
 
     Raises BadModelError unless the matrices are square, finite, of one size and not too many, and the horizon positive;
     DisagreementError if crossings and eigenvalues contradict each other (a loop at the limit of double precision).

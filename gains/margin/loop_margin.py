@@ -21,7 +21,7 @@ from gains.core.structure import (
     distinct_blocks,
     is_singular_for_any_delay,
     of_type,
-    without_equilibria,
+    without_fixed_roots,
 )
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
 from gains.delay._loci import factor_rank
@@ -45,6 +45,8 @@ _LARGEST_MAP = 300
 _ROUNDING = 1e-11
 # backward error of such a map, in units of n eps and its norm
 _BACKWARD = 10.0
+# the rounding of the matrices and of a delay alone moves a root this far, relative to its size
+_ON_AXIS = 8.0 * float(np.finfo(np.float64).eps)
 # relative distance of neighbouring delays or periods, and the noise of a radius in units of the spread at three of them
 _NEIGHBOUR, _NOISE = 1e-15, 4.0
 
@@ -99,8 +101,8 @@ class LoopAtGivenDelays:
 
     @property
     def is_stable(self) -> bool:
-        """Whether all roots are left of the imaginary axis."""
-        return self.rightmost_root.real < 0.0
+        """Whether all other roots are left of the imaginary axis by more than their rounding."""
+        return self.rightmost_root.real < -_ON_AXIS * abs(self.rightmost_root)
 
 
 def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
@@ -134,13 +136,24 @@ def as_known(value: float, error: float) -> str:
 
 
 def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
-    from gains.delay.rightmost import rightmost_root
+    from gains.delay.rightmost import rightmost_roots
 
     # rounding would move a root at 0 to either side
-    moving, fixed = without_equilibria(*(term.matrix for term in model.terms))
-    root = rightmost_root([(A, term.fixed_s) for A, term in zip(moving, model.terms, strict=True)])
-    unstable = int(np.count_nonzero(np.linalg.eigvals(np.sum(moving, axis=0)).real > 0.0))
-    return LoopAtGivenDelays(root, unstable, fixed)
+    moving, fixed = without_fixed_roots(*(term.matrix for term in model.terms))
+    late: list[complex] = []
+    unstable = 0
+    for block in distinct_blocks(*moving):
+        terms = [(A, term.fixed_s) for A, term in zip(block.matrices, model.terms, strict=True)]
+        roots, at_once = rightmost_roots(terms, 2), np.linalg.eigvals(np.sum(block.matrices, axis=0))
+        # a root at 0 where feedback cancels, as with an unknown delay, unless the block has no other root
+        if len(roots) > 1 and np.any(block.matrices) and is_singular_for_any_delay(balanced(*block.matrices)):
+            if roots[1].real <= 0.0:  # else both may be right of it
+                roots = np.delete(roots, np.argmin(np.abs(roots)))
+            at_once = np.delete(at_once, np.argmin(np.abs(at_once)))
+            fixed += block.copies
+        late.append(complex(roots[0]))
+        unstable += block.copies * int(np.count_nonzero(at_once.real > 0.0))
+    return LoopAtGivenDelays(max(late, key=lambda root: root.real), unstable, fixed)
 
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
@@ -165,6 +178,9 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         blocks = distinct_blocks(*(term.matrix for term in terms))
         if any(is_singular_for_any_delay(balanced(*block.matrices)) for block in blocks):
             notes = ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
+    starts_s = [start_s for start_s, _ in analysis.stable_intervals_s]
+    if 0.0 in starts_s and any(crossing.delay_s == 0.0 for crossing in analysis.crossings):
+        notes += (f"at {model.unknown} = 0 itself roots are on the imaginary axis: stable only beyond it",)
     places = [(crossing.omega_rad_s, crossing.delay_s) for crossing in analysis.crossings[:_ERRORS_OF]]
     errors_s = [by_delay_s * scale for _, by_delay_s in crossing_errors(terms, places)]
     errors_s += [np.nan] * (len(analysis.crossings) - len(errors_s))
@@ -185,7 +201,7 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
 
 
 def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysis, int]:
-    """The terms with each distinct block once, the analysis of the loop, and the number of equilibria left out."""
+    """The terms with each distinct block once, the analysis of the loop, and the number of fixed roots left out."""
     from gains.delay._commensurate import analyse_block
     from gains.delay._mixed import analyse_mixed_block
 
@@ -195,7 +211,7 @@ def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysi
     blocks: list[Block] = []
     taken_out = 0
     for block in distinct_blocks(*(term.matrix for term in terms)):
-        moving, fixed = without_equilibria(*block.matrices)
+        moving, fixed = without_fixed_roots(*block.matrices)
         taken_out += block.copies * fixed
         blocks += [replace(part, copies=part.copies * block.copies) for part in distinct_blocks(*moving)]
     once = block_diagonal([block.matrices for block in blocks])
@@ -207,17 +223,19 @@ def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysi
 def fixed_note(fixed: int, where: str) -> tuple[str, ...]:
     """Note on the roots that are left out; empty if there are none."""
     stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
-    why = "an equilibrium, such as the common value of a consensus"
+    why = "a motion that the loop does not bring back, such as the common value of a consensus"
+    if fixed > 1:
+        why = f"{why}; one that drives another makes it grow with time"
     return (f"{stay} at {where} ({why}); everything else is about the other roots",) if fixed else ()
 
 
 def _held_moving(model: HeldModel) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int]:
-    """A, B and K of a held loop without its equilibria, and the number of states removed.
+    """A, B and K of a held loop without its fixed roots, and the number of states removed.
 
     A direction along which neither A nor B K acts keeps an eigenvalue of the one-period map at one, at every delay and
     period; rounding would move it to either side of the unit circle.
     """
-    (plant, feedback), fixed = without_equilibria(model.A, model.B @ model.K)
+    (plant, feedback), fixed = without_fixed_roots(model.A, model.B @ model.K)
     return ((plant, *factor_rank(feedback)), fixed) if fixed else ((model.A, model.B, model.K), 0)
 
 

@@ -140,6 +140,7 @@ def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dic
             "unstable_roots_at_zero_delay": found.unstable_roots_at_zero_delay,
             "roots_fixed_at_zero": found.roots_fixed_at_zero,
             "crossings": [],
+            "notes": fixed_note(found.roots_fixed_at_zero, "0 at every delay"),
         }
     crossings = [{name: known for name, known in vars(c).items() if known is not None} for c in found.crossings]
     fields = vars(found) | {"crossings": crossings, "delay_independent": not isfinite(found.delay_margin_s)}

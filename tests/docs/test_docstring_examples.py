@@ -35,7 +35,7 @@ INTERNAL_FUNCTIONS = {
     "gains.core.structure.real_matrix",
     "gains.core.structure.seconds",
     "gains.core.structure.square_matrices",
-    "gains.core.structure.without_equilibria",
+    "gains.core.structure.without_fixed_roots",
     "gains.criteria.parts.parts_of",
     "gains.criteria.parts.rounded",
     "gains.delay.several.crossing_curves",

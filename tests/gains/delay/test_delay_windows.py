@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
-from gains.core.structure import without_equilibria
+from gains.core.structure import without_fixed_roots
 from gains.delay.constant import Crossing, analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.delay.sweep import frequency_sweep_margin
@@ -175,7 +175,7 @@ def test_root_at_zero_for_every_delay_means_never_asymptotically_stable() -> Non
 def test_consensus_without_its_common_value_takes_the_published_delay() -> None:
     # s + lambda e^{-s tau} for each eigenvalue: pi / (2 lambda_max), 3 for a path of three
     laplacian = np.array([[1.0, -1.0, 0.0], [-1.0, 2.0, -1.0], [0.0, -1.0, 1.0]])
-    moving, _ = without_equilibria(np.zeros((3, 3)), -laplacian)
+    moving, _ = without_fixed_roots(np.zeros((3, 3)), -laplacian)
     assert delay_margin(*moving) == pytest.approx(pi / 6.0, rel=1e-13)
 
 

@@ -1,4 +1,4 @@
-"""Splitting into strongly connected blocks, balancing, and removing equilibria."""
+"""Splitting into strongly connected blocks, balancing, and removing roots fixed at zero."""
 
 import networkx as nx
 import numpy as np
@@ -14,7 +14,7 @@ from gains.core.structure import (
     distinct_blocks,
     square_matrices,
     strongly_connected_blocks,
-    without_equilibria,
+    without_fixed_roots,
 )
 
 sparse_matrices = st.integers(1, 9).flatmap(
@@ -81,7 +81,7 @@ def test_balancing_is_an_exact_similarity() -> None:
 
 def test_consensus_loses_its_common_value_only() -> None:
     laplacian = np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    (A0, A1), gone = without_equilibria(np.zeros((3, 3)), -laplacian)
+    (A0, A1), gone = without_fixed_roots(np.zeros((3, 3)), -laplacian)
     assert gone == 1
     assert not A0.any()
     # eigenvalues 0, 1, 3 of the Laplacian; 1e-14 is rounding
@@ -92,7 +92,7 @@ def test_formation_at_constant_velocity_loses_position_and_velocity() -> None:
     laplacian = np.array([[1.0, -1.0], [-1.0, 1.0]])
     A0 = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2))
     A1 = np.kron([[0.0, 0.0], [-1.0, -1.0]], laplacian)
-    reduced, gone = without_equilibria(A0, A1)
+    reduced, gone = without_fixed_roots(A0, A1)
     assert gone == 2
     # one relative motion is left: s^2 + 2 s + 2
     assert np.poly(reduced[0] + reduced[1]) == pytest.approx([1.0, 2.0, 2.0], rel=1e-14)
@@ -114,22 +114,22 @@ def test_wrong_matrices_are_named(matrices: dict[str, FloatArray], message: str)
         square_matrices(**matrices)
 
 
-def test_equilibria_go_block_by_block_and_the_other_roots_stay() -> None:
+def test_fixed_roots_go_block_by_block_and_the_other_roots_stay() -> None:
     # two rings of consensus, the second driven by the first, and a lag: two common values go
     ring = np.array([[-2.0, 1.0, 1.0], [1.0, -2.0, 1.0], [1.0, 1.0, -2.0]])
     A1 = np.zeros((7, 7))
     A1[:3, :3], A1[3:6, 3:6], A1[3, 0] = ring, 2.0 * ring, 0.5
     A0 = np.diag([0.0] * 6 + [-1.0])
-    (now, late), gone = without_equilibria(A0, A1)
+    (now, late), gone = without_fixed_roots(A0, A1)
     assert gone == 2
     kept = np.sort(np.linalg.eigvals(now + late).real)
     # eigenvalues of a ring of three: 0, -3, -3; double ones are known to half the digits
     assert kept == pytest.approx([-6.0, -6.0, -3.0, -3.0, -1.0], abs=1e-7)
 
 
-def test_matrices_without_equilibria_come_back_as_they_were() -> None:
+def test_matrices_without_fixed_roots_come_back_as_they_were() -> None:
     A0, A1 = np.array([[-1.0, 0.0], [5.0, 0.0]]), np.array([[0.0, 0.0], [0.0, -2.0]])
-    (now, late), gone = without_equilibria(A0, A1)
+    (now, late), gone = without_fixed_roots(A0, A1)
     assert gone == 0
     assert np.array_equal(now, A0)
     assert np.array_equal(late, A1)
@@ -137,5 +137,5 @@ def test_matrices_without_equilibria_come_back_as_they_were() -> None:
 
 def test_integrator_that_nobody_feeds_back_stays() -> None:
     # without it nothing is left of its block; with it the loop is not stable
-    _, gone = without_equilibria(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.zeros((2, 2)))
+    _, gone = without_fixed_roots(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.zeros((2, 2)))
     assert gone == 0

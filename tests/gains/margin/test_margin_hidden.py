@@ -4,6 +4,7 @@ The random part takes a seeded sample. All thousand: MARGIN_SYSTEMS=1000 pytest
 tests/gains/margin/test_margin_hidden.py -n auto
 """
 
+import json
 import os
 from math import acos, atan, inf, isfinite, pi, sqrt
 
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.delay.sweep import circle_sweep_margin, frequency_sweep_margin
-from gains.margin.loop_margin import loop_margin
+from gains.margin.loop_margin import LoopAtGivenDelays, loop_margin
 from gains.margin.model_file import parse_model
 from gains.margin.opinions import checked_delay_margin
 from gains.varying.bounds import varying_delay_bound
@@ -168,6 +169,50 @@ def test_a_zero_root_without_equilibrium_is_left_out_and_reported() -> None:
     result = result_of([[1.0]], [[-1.0]])
     assert result["stable_intervals_s"] == [[0.0, pytest.approx(1.0, rel=1e-14)]]
     assert result["checked_by"] == ["root count"]
+
+
+@pytest.mark.parametrize("delay_s", [0.5, 1.2])
+def test_given_delays_leave_out_the_zero_root_of_cancelled_feedback(delay_s: float) -> None:
+    # s - 1 + e^{-s tau}: the second real root passes zero at tau = 1
+    text = f'{{"terms": [{{"A": [[1]], "delay": 0}}, {{"A": [[-1]], "delay": {delay_s}}}]}}'
+    result = margin_fields(loop_margin(parse_model(text)))
+    assert (result["stable"], result["roots_fixed_at_zero"]) == (delay_s < 1.0, 1)
+    assert "1 root stays at 0" in str(result["notes"])
+
+
+def test_given_delays_report_the_rightmost_of_two_unstable_roots() -> None:
+    # beside the zero root of x' = 0.5 x - 0.5 y, y' = the same negated, is the pair 0.9 +- 50j, driven and driving
+    root, pair = np.array([[1.0, -1.0], [-1.0, 1.0]]) / 2.0, np.array([[0.9, 50.0], [-50.0, 0.9]])
+    whole = np.block([[root, np.zeros((2, 2))], [np.zeros((2, 2)), pair]])
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(4, 4)))[0]
+    terms = [{"A": (turn @ whole @ turn.T - 3.0 * np.eye(4)).tolist(), "delay": 0.0}]
+    found = loop_margin(parse_model(json.dumps({"terms": [*terms, {"A": (3.0 * np.eye(4)).tolist(), "delay": 1e-9}]})))
+    assert isinstance(found, LoopAtGivenDelays)
+    assert found.rightmost_root == pytest.approx(1.0, rel=1e-6)
+    assert found.roots_fixed_at_zero == 1
+
+
+@pytest.mark.parametrize("gain", [1.0, 3.0, 1e-6, 1e6])
+def test_roots_on_the_axis_at_a_given_delay_are_not_stable(gain: float) -> None:
+    text = f'{{"terms": [{{"A": [[-{gain!r}]], "delay": {pi / (2.0 * gain)!r}}}]}}'
+    assert margin_fields(loop_margin(parse_model(text)))["stable"] is False
+
+
+def test_a_loop_marginal_at_no_delay_says_so() -> None:
+    # s^2 + 1 - 0.1 e^{-s tau}: +- 0.949j at tau = 0, left of the axis at once; a damped loop says nothing
+    result = result_of([[0.0, 1.0], [-1.0, 0.0]], [[0.0, 0.0], [0.1, 0.0]])
+    assert str(result["stable_intervals_s"]).startswith("[[0.0, ")
+    assert result["notes"] == ["at tau = 0 itself roots are on the imaginary axis: stable only beyond it"]
+    assert result_of([[0.0, 1.0], [-1.0, -1.0]], [[0.0, 0.0], [0.1, 0.0]])["notes"] == []
+
+
+def test_a_formation_that_drifts_is_not_called_an_equilibrium() -> None:
+    laplacian = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    free, acts = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2)), np.kron([[0.0, 0.0], [-1.0, -1.0]], laplacian)
+    result = result_of(free, acts)
+    assert result["roots_fixed_at_zero"] == 2
+    assert "equilibrium" not in str(result["notes"])
+    assert "grow with time" in str(result["notes"])
 
 
 def test_an_integrator_without_feedback_is_stable_at_no_delay() -> None:
