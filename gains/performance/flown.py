@@ -9,7 +9,8 @@ In flight a command acts after the loop delay τ and is held for a control perio
 
 The loop stays stable under any disturbance |w| ≤ α |x| up to α(τ), the least singular value over all frequencies of
 its characteristic matrix (the complex stability radius). A complex disturbance of one axis is a real one of two axes,
-so no larger real bound exists for north and east together. The sampled loop differs to second order in T.
+so no larger real bound exists for north and east together. The sampled loop differs to second order in T. At slow
+rates this model loses stability before the sampled loop does; between the two margins α is that of the sampled loop.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,9 @@ import numpy as np
 from gains.core._bracketing import highest, met_end
 from gains.core.arrays import ComplexArray, FloatArray, least_singular_values, spectral_norms
 from gains.formation.model import FormationModel
-from gains.performance.response import Response
+from gains.performance.disturbed import DisturbedFormation
+from gains.performance.radii import SectorLoop
+from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.performance.string_stability import largest_magnitude, string_peak
 from gains.sampled.onboard import own_part
@@ -56,11 +59,22 @@ class FlownTiming:
     """Where the vehicles' own loops are closed."""
     step_s: float = 0.0
     """Period of the loop on board."""
+    delay_margin_continuous_s: float = inf
+    """The same margin in continuous time, without the hold; `inf` if there is none or it is not known."""
 
     def delays_s(self, delay_s: float) -> tuple[float, float]:
         """Delays (s) of a vehicle's own errors and of those of others at a loop delay (s), including holds."""
         late_s = delay_s + self.period_s / 2.0
         return (late_s if self.all_late else self.step_s / 2.0), late_s
+
+    def is_misjudged(self, delay_s: float) -> bool:
+        """Whether half a hold as delay makes the loop unstable at a loop delay (s) at which the sampled one is stable.
+
+        >>> FlownTiming(0.8, 1.0, delay_margin_continuous_s=1.25).is_misjudged(0.78)
+        True
+        """
+        late_s = self.delays_s(delay_s)[1]
+        return self.all_late and self.delay_margin_continuous_s <= late_s and delay_s < self.delay_margin_s
 
     @property
     def all_late(self) -> bool:
@@ -90,6 +104,10 @@ class FlownFormation:
         """α at a loop delay (s); 0 from the margin on."""
         if not delay_s < self.timing.delay_margin_s:
             return 0.0
+        if self.timing.is_misjudged(delay_s):
+            model, K = self._narrowed
+            flown = DisturbedFormation(model, *formation_loop(model, K, self.responses), self.timing.period_s, delay_s)
+            return SectorLoop(flown, tuple(range(model.states))).complex_radius().radius_1_s
         return -highest(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())[1]
 
     def alpha_limit_s(self, alpha: float) -> float:

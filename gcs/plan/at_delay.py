@@ -57,6 +57,8 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
     else:
         flown, chains = _flown(design, scenario, gain_set)
         alphas, peaks = [own.alpha(delay_s) for own in flown], [own.string_peak(delay_s) for own in chains]
+        if any(own.timing.is_misjudged(delay_s) for own in flown):
+            return FiguresAtDelay(loop_delay_s=delay_s, alpha=min(alphas), discrete=True, has_string_verdict=False)
     if not alphas:
         return unknown
     return FiguresAtDelay(
@@ -115,7 +117,7 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     if not (own < 0.0 < spacing):
         return []
     scalar = ScalarGains(-own, front * entry.streamed_share, spacing, 0.0)
-    timing = flown_timing(design, entry.delay_margin_s)
+    timing = flown_timing(design, entry)
     return [FlownLoop(scalar, timing, answer) for answer in set(design.responses.values()) or [None]]
 
 
@@ -129,12 +131,14 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     return FlownFormation(
         model,
         own + entry.streamed_share * (scaled - own),
-        flown_timing(design, entry.delay_margin_s),
+        flown_timing(design, entry),
         tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )
 
 
-def flown_timing(design: Design, margin_s: float | None = None) -> FlownTiming:
-    """The timing of a design's loop; `margin_s` is None without a limit, as in design.json."""
+def flown_timing(design: Design, entry: GainSet | None = None) -> FlownTiming:
+    """The timing of a design's loop, with the margins of an entry of its schedule if one is given."""
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
-    return FlownTiming(inf if margin_s is None else margin_s, design.period_s, design.loop, step_s)
+    margins_s = (None, None) if entry is None else (entry.delay_margin_s, entry.delay_margin_continuous_s)
+    sampled_s, continuous_s = (inf if margin_s is None else margin_s for margin_s in margins_s)
+    return FlownTiming(sampled_s, design.period_s, design.loop, step_s, continuous_s)

@@ -49,6 +49,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
         spacing_gain_s2=spacing_gain_s2,
         noise_gain=plain(figures.noise_gain_max) if figures.timing.all_late else None,
         weight=figures.weight or (1.0, 1.0),
+        discrete=figures.discrete,
     )
 
 

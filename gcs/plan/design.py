@@ -145,6 +145,9 @@ class FiguresAtDelay(Published):
 
     loop_delay_s: float | None
     alpha: float | None = None
+    discrete: bool = False
+    """Whether α is that of the loop in discrete time: half a hold as delay would call this loop unstable. The growth of
+    spacing errors is then unknown."""
     has_string_verdict: bool = True
     """Whether the formation has chains of identical followers; otherwise no string peak is defined."""
     string_peak: float | None = None
@@ -199,6 +202,8 @@ class CriteriaPart(Published):
     spacing_gain_s2: float | None
     noise_gain: float | None
     weight: tuple[float, float] = (1.0, 1.0)
+    discrete: bool = False
+    """Whether decay and α at the delay are those of the loop in discrete time."""
     alpha_bound: float | None = None
     """Upper bound on the α of any controller at the delay. Only `gcs design` computes this and the fields below."""
     delays_jumping_s: tuple[float, float] | None = None

@@ -98,6 +98,7 @@ def _print_criteria(found: CriteriaPart, console: Console) -> None:
         f"criteria without delay: roots have damping {found.damping:.3f} and natural frequencies up to "
         f"{found.natural_frequency_rad_s:.3f} rad/s"
     )
+    bound += ", by the loop in discrete time" if found.discrete else ""
     weight = "" if found.weight == (1.0, 1.0) else f" with W = {found.weight[0]:g}, {found.weight[1]:g}"
     console.print(
         f"         {at}: decay {found.decay_rate_at_delay_1_s:.3f} 1/s, alpha{weight} {found.alpha_at_delay:.4f}{bound}"
@@ -180,6 +181,8 @@ def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> 
 def figures_text(flown: FiguresAtDelay, at: str = "at {} of loop delay") -> str:
     """In words, α at a loop delay and, if spacing errors propagate along a chain, their growth at that delay."""
     delay = at.format(ms_text(flown.loop_delay_s))
+    if flown.discrete:
+        return f"{flown.alpha:.4f} {delay}, by the loop in discrete time"
     if not flown.has_string_verdict:
         return f"{flown.alpha:.4f} of the whole formation {delay}"
     return f"{flown.alpha:.4f} {delay}, where spacing errors {growth_text(flown.string_peak)} from vehicle to vehicle"

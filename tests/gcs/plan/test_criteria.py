@@ -54,6 +54,19 @@ def test_a_stable_loop_decays_at_slow_rates_too(rate_hz: float, decay_1_s: float
     assert found.criteria.spacing_gain_s2 is None
 
 
+@pytest.mark.parametrize("rate_hz", [1.0, 2.0])
+def test_slow_rates_have_one_alpha_and_name_its_model(rate_hz: float) -> None:
+    found = flight_plan(load(SCENARIOS / "chain3.toml").at_rates(control_hz=rate_hz, telemetry_hz=rate_hz))[0]
+    assert found.criteria is not None
+    assert found.at_loop_delay is not None
+    assert found.at_loop_delay.alpha == pytest.approx(found.criteria.alpha_at_delay, rel=1e-9)
+    assert found.at_loop_delay.string_peak is None
+    console = plain_console()
+    with console.capture() as printed:
+        print_design(found, console)
+    assert printed.get().count("in discrete time") == 2
+
+
 def test_a_scenario_is_designed_for_its_delay() -> None:
     keys = '[control.criteria]\nat_delay_s = 0.3\nmaximise = "decay_rate_at_delay_1_s"'
     scenario = parse(chain_with(keys), Path("scenario.toml"))
