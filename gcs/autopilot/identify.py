@@ -36,13 +36,15 @@ MISFIT_MAX = 0.1
 LEAST_RATE_HZ = 10.0
 _FEWEST_SAMPLES = 42
 """At 10 Hz the manoeuvre gives sixty samples, some of which may be lost."""
-_BOUNDS = np.log([(0.01, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
+LAG_S_LEAST = 0.01
+"""The shortest lag that is fitted: a vehicle whose fit ends here may respond at once."""
+_BOUNDS = np.log([(LAG_S_LEAST, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
 """Bounds of lag, velocity gain, dead time and natural frequency, as logarithms."""
 _USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
 _GAIN = 1
 """Index of the velocity gain in `_BOUNDS`."""
 _STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2
-_RESOLUTION = 1e-3
+RESOLUTION = 1e-3
 """Misfits that differ by less than this fraction of the velocity do not distinguish models."""
 
 
@@ -188,7 +190,7 @@ def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
     count = max(10.0, n * (1.0 - alike) / (1.0 + alike)) if alike > 0.0 else float(n)
 
     def criterion(name: str) -> float:
-        return count * float(np.log(rms[name] ** 2 + _RESOLUTION**2)) + len(_USED[name]) * float(np.log(count))
+        return count * float(np.log(rms[name] ** 2 + RESOLUTION**2)) + len(_USED[name]) * float(np.log(count))
 
     return min(rms, key=criterion)
 

@@ -168,8 +168,11 @@ def in_words(found: Identified) -> str:
     late = f", dead time {response.dead_time_s:.3f} s" if response.dead_time_s else ""
     if response.natural_frequency_rad_s is not None:
         late = f", natural frequency {response.natural_frequency_rad_s:.1f} rad/s, damping {response.damping:.2f}"
+    lag = f"lag {response.lag_s:.3f} s"
+    if response.lag_s < 1.001 * identify.LAG_S_LEAST:
+        lag = f"lag at most {identify.LAG_S_LEAST:.3f} s, the shortest that is fitted"
     others = ", ".join(f"{name} {misfit:.1%}" for name, misfit in found.misfits.items() if name != response.model)
     return (
-        f"{response.model}: lag {response.lag_s:.3f} s{late}, velocity gain {response.velocity_gain_1_s:.2f} 1/s, "
+        f"{response.model}: {lag}{late}, velocity gain {response.velocity_gain_1_s:.2f} 1/s, "
         f"misfit {found.misfit:.1%} ({others})"
     )

@@ -1,7 +1,8 @@
 """`gcs identify`: how a scenario's vehicles respond to accelerations, from flights of one of them in virtual time.
 
 For each axis, the leader flies alone, without delay and undisturbed. Its nominal velocity jumps along or across its
-course, and a weak loop follows it. The models of `gcs.autopilot.identify` are fitted to commands and velocities.
+course, and a weak loop follows it, at no less than LEAST_RATE_HZ: slower control would leave too few samples. The
+models of `gcs.autopilot.identify` are fitted to commands and velocities.
 """
 
 from collections.abc import Mapping
@@ -9,7 +10,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from gcs.autopilot.identify import MISFIT_MAX, Flown, Identified, identify
+from gcs.autopilot.identify import LEAST_RATE_HZ, MISFIT_MAX, RESOLUTION, Flown, Identified, identify
 from gcs.autopilot.manoeuvre import in_words
 from gcs.drive.flown import fly_plan
 from gcs.errors import InputError
@@ -23,7 +24,7 @@ from scenarios.schema import Clocks, Control, FixedGains, Limits, Links, Nominal
 _AXES = "along", "across"
 _LEAST = 0.001
 _WHERE_RAD_S = 1.0
-"""Frequency of comparison: the slower axis is the one that lags more here."""
+"""Frequency of comparison: the slower axis is the one that lags more here. A misfit m leaves m rad of phase open."""
 _GAINS = FixedGains(K1=-0.5, K2=0.0, K3=0.1)
 _JUMPS, _JUMP_S = (1, -1, -1, 1, 1, -1, 1, 0), 4.0
 _JUMP_M_S = 0.5
@@ -42,7 +43,7 @@ def responses_of(scenario: Scenario) -> Mapping[str, Identified]:
 
 def _identified(scenario: Scenario, axis: str) -> Identified:
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
-    nominal = np.array(scenario.nominal_velocity_at(0.0))
+    nominal, rates = np.array(scenario.nominal_velocity_at(0.0)), scenario.rates
     ahead = nominal / np.hypot(*nominal)
     direction = ahead if axis == _AXES[0] else np.array([-ahead[1], ahead[0]])
     jumps = [nominal + jump * _JUMP_M_S * direction for jump in _JUMPS]
@@ -63,7 +64,9 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
         "disturbance": None,
         "navigation": None,
     }
+    control_hz, telemetry_hz = (max(own, LEAST_RATE_HZ) for own in (rates.control_hz, rates.telemetry_hz))
     alone = scenario.in_steady_flight().with_calm_monitor().model_copy(update=changes)
+    alone = alone.at_rates(control_hz=control_hz, telemetry_hz=telemetry_hz)
     flight = fly_plan(flight_plan(alone)[1], with_truth=True)
     assert flight.truth is not None
     rows = flight.ticks[flight.ticks["commanded"]]
@@ -89,11 +92,17 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
 
 def as_toml(found: Mapping[str, Identified]) -> str:
     """The results as TOML comments, followed by the response of the slower axis as a table of a scenario."""
-    slower = min(found, key=lambda axis: float(np.angle(found[axis].response.transfer(np.array(_WHERE_RAD_S)))))
+    phases = {axis: float(np.angle(one.response.transfer(np.array(_WHERE_RAD_S)))) for axis, one in found.items()}
+    slower = min(phases, key=phases.__getitem__)
+    lags = f"{slower} the course it lags more at {_WHERE_RAD_S:g} rad/s"
+    if max(phases.values()) - phases[slower] <= sum(max(one.misfit, RESOLUTION) for one in found.values()):
+        lags = (
+            f"both lag alike at {_WHERE_RAD_S:g} rad/s, within their misfits; this is the response {slower} the course"
+        )
     values = {name: round(value, 3) for name, value in asdict(found[slower].response).items() if value}
     lines = [
         *(f"# {axis} the course: {in_words(one)}" for axis, one in found.items()),
-        f"# {slower} the course it lags more at {_WHERE_RAD_S:g} rad/s",
+        f"# {lags}",
         "[response]",
         *(f"{name} = {value}" for name, value in values.items() if value > _LEAST),
     ]

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gains.performance.response import Response
+from gcs.autopilot.identify import Identified
 from gcs.drive.flown import fly_plan
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
@@ -49,6 +51,27 @@ def test_a_known_lag_is_found_again(tmp_path: Path) -> None:
         assert found.misfit < 0.002
 
 
+def test_a_known_lag_is_found_at_a_slow_control_rate(tmp_path: Path) -> None:
+    """At 1 Hz the flight would have 32 samples, and set-points as rare as the timeout of the failsafe."""
+    (tmp_path / "lagged.py").write_text(LAGGED)
+    file = tmp_path / "lagged.toml"
+    file.write_text(
+        TEXANS.replace('"jsbsim"', '"lagged.py:step"') + "rates = { control_hz = 1.0, telemetry_hz = 1.0 }\n"
+    )
+    found = responses_of(load(file))
+    for own in found.values():
+        assert own.response.lag_s == pytest.approx(0.3, rel=0.005)
+    # the same along and across, to rounding
+    assert "# both lag alike at 1 rad/s" in as_toml(found)
+
+
+def test_axes_that_differ_by_more_than_their_misfits_are_ranked() -> None:
+    misfits = {"lag": 0.005}
+    quick, slow = (Identified(Response(lag_s, 0.0, 0.0, None), 0.005, 100, misfits) for lag_s in (0.3, 0.33))
+    assert "# across the course it lags more at 1 rad/s" in as_toml({"along": quick, "across": slow})
+    assert "# along the course it lags more at 1 rad/s" in as_toml({"along": slow, "across": quick})
+
+
 def test_no_velocity_gain_is_found_where_none_is_accepted(tmp_path: Path) -> None:
     # a vehicle that responds at once; with a velocity gain, other commands refuse the response
     (tmp_path / "at_once.py").write_text(
@@ -63,6 +86,7 @@ def test_no_velocity_gain_is_found_where_none_is_accepted(tmp_path: Path) -> Non
     assert all(one.response.velocity_gain_1_s == 0.0 and one.misfit < 0.01 for one in found.values())
     file.write_text(text + as_toml(found))
     assert load(file).response is not None
+    assert as_toml(found).count("lag at most 0.010 s, the shortest that is fitted") == 2
 
 
 def test_aircraft_flies_to_the_margin_computed_with_its_identified_response() -> None:
