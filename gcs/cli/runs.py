@@ -27,11 +27,19 @@ def print_grade(result: "Grade") -> None:
     from gcs.views.console import ms_text
 
     print(f"errors against the truth, {result.vehicles} vehicles, ms")
-    titles = "loop delay, measured", "round trip, measured", "delay of the up links, emulated"
-    for title, own in zip(titles, (result.loop_delay, result.rtt, result.link_delay), strict=True):
+    rows = {
+        "loop delay, measured": result.loop_delay,
+        "round trip, measured": result.rtt,
+        "delay of the up links, emulated": result.link_delay,
+    }
+    if result.down_jitter.error_max_s:
+        rows["jitter of the down links"] = result.down_jitter
+    for title, own in rows.items():
         errors_s = own.error_p50_s, own.error_p99_s, own.error_max_s
         p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
         print(f"{title:<32} p50 {p50}  p99 {p99}  max {largest}  of {own.samples}")
+    if result.down_jitter.error_max_s:
+        print("a loop delay is also wrong by the jitter between its set-point and the last TIMESYNC request")
 
 
 def view(

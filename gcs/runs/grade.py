@@ -37,12 +37,15 @@ class Graded(Published):
 
 
 class Grade(Published):
-    """The errors of a run's loop delays and round trips, and the lateness of its emulated links."""
+    """The errors of a run's loop delays and round trips, and the lateness and the jitter of its emulated links."""
 
     vehicles: int
     loop_delay: Graded
     rtt: Graded
     link_delay: Graded
+    down_jitter: Graded
+    """How far the delays of the down links are from their vehicle's median. A loop delay is also off by the difference
+    between that of its own set-point, which cannot be known when it is sent, and that of the last TIMESYNC request."""
 
 
 def grade(folder: Path) -> Grade:
@@ -68,11 +71,15 @@ def grade(folder: Path) -> Grade:
     trip_errors_s = np.concatenate(trips_s)
     left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
     late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
+    down = truth[(truth["kind"] == LINK_DOWN) & (truth["fate"] & DROPPED == 0)]
+    downs_s = [(own["due_ns"] - own["entered_ns"]) * 1e-9 for own in by_vehicle(down).values()]
+    jitter_s = np.concatenate([np.zeros(0), *(own_s - np.median(own_s) for own_s in downs_s)])
     return Grade(
         vehicles=len(system_ids),
         loop_delay=graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
         rtt=graded(trip_errors_s, np.zeros(len(trip_errors_s))),
         link_delay=graded(late_s, np.zeros(len(late_s))),
+        down_jitter=graded(jitter_s, np.zeros(len(jitter_s))),
     )
 
 
