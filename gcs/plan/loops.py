@@ -7,6 +7,7 @@ loop may break far below it or stay stable far above it. Its growth at the loop 
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
+from functools import cache
 from math import inf, isnan, nan
 
 from gains.performance.response import formation_loop, response_states
@@ -18,7 +19,8 @@ from scenarios.keys.own import BUILT_IN
 
 _STEP, _STEPS = 0.1, 100
 """Size, as a share of the margin, and number of the steps that search for a shared loop's edge of stability."""
-_HALVINGS = 8
+_BY_COUNT, _BY_GROWTH = 1.0 / 512.0, 1e-6
+"""Accuracy of that edge, as a share of a step: by counted roots, which bisect, and by growth rates, which converge."""
 _MOST_BY_GROWTH, _MOST_SHARING = 6, 20
 """Most vehicles in a shared loop whose edge of stability is found: by growth rates, which takes seconds, and at all."""
 
@@ -71,6 +73,11 @@ def _is_stable(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> bool:
     return block.is_stable_at(loop_delay_s, _ages_s(block, loop_delay_s))
 
 
+def _sign(block: CoupledBlock, loop_delay_s: Mapping[int, float]) -> float:
+    """The sign of the growth rate, by counting roots."""
+    return -1.0 if _is_stable(block, loop_delay_s) else 1.0
+
+
 def growth_of(plan: FlightPlan, system_id: int) -> Callable[[float], float]:
     """The predicted growth rate (1/s) of a vehicle's loop, as a function of its loop delay (s); other links stay."""
     block, expected_s = loop_of(plan, system_id), planned_loop_delays_s(plan)
@@ -81,8 +88,8 @@ def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Windo
     """Range of one vehicle's loop delays in which its loop is predicted stable; if not `is_modelled`, up to the margin.
 
     The links of all other vehicles stay as they are in the scenario. If a shared loop is unstable over the scenario's
-    links, shorter delays of this vehicle are searched; the result is (0, 0) if none makes it stable. The growth changes
-    sign at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead.
+    links, shorter delays of this vehicle are searched; the result is (0, 0) if none makes it stable. The growth is
+    zero at the ends, which agree with flights to 0.1 %; if `quick`, or for many vehicles, roots are counted instead.
     """
     block = loop_of(plan, system_id)
     if not is_modelled(plan):
@@ -92,31 +99,34 @@ def window_of(plan: FlightPlan, system_id: int, *, quick: bool = False) -> Windo
     if block.margin_s() == inf:
         return 0.0, inf
     expected_s = planned_loop_delays_s(plan)
+    counted = quick or len(block.system_ids) > _MOST_BY_GROWTH
+    resolution = _BY_COUNT if counted else _BY_GROWTH
 
-    def is_stable_at(delay_s: float) -> bool:
+    @cache
+    def growth(delay_s: float) -> float:
         delays_s = expected_s | {system_id: delay_s}
-        if quick or len(block.system_ids) > _MOST_BY_GROWTH:
-            return _is_stable(block, delays_s)
-        return growth_1_s(block, delays_s) < 0.0
+        return _sign(block, delays_s) if counted else growth_1_s(block, delays_s)
 
-    now_s = expected_s[system_id]
-    step_s, stable = _STEP * block.margin_s(), is_stable_at(now_s)
-    shorter_s = 0.0
+    now_s, step_s = expected_s[system_id], _STEP * block.margin_s()
+    stable, shorter_s = growth(now_s) < 0.0, 0.0
     if plan.assumed_s is not None or not stable:
-        shorter_s = _edge_s(is_stable_at, now_s, -step_s, end_s=0.0, stable=stable)
-    return (shorter_s, _edge_s(is_stable_at, now_s, step_s, end_s=inf, stable=True)) if stable else (0.0, shorter_s)
+        shorter_s = _edge_s(growth, now_s, -step_s, end_s=0.0, resolution=resolution)
+    if not stable:
+        return 0.0, shorter_s
+    return shorter_s, _edge_s(growth, now_s, step_s, end_s=inf, resolution=resolution)
 
 
-def _edge_s(is_stable_at: Callable[[float], bool], at_s: float, step_s: float, *, end_s: float, stable: bool) -> float:
-    """The delay at which stability ends or, if the loop is not `stable` at first, begins; `end_s` if there is none."""
+def _edge_s(
+    growth: Callable[[float], float], at_s: float, step_s: float, *, end_s: float, resolution: float = _BY_COUNT
+) -> float:
+    """The delay at which growth, or its sign alone, changes from the one at `at_s`; `end_s` if it does not."""
+    from scipy.optimize import brentq
+
+    stable = growth(at_s) < 0.0
     for _ in range(_STEPS):
-        inner_s, at_s = at_s, at_s + step_s
-        at_s = max(0.0, at_s)
-        if is_stable_at(at_s) != stable:
-            for _ in range(_HALVINGS):
-                middle_s = (inner_s + at_s) / 2.0
-                inner_s, at_s = (middle_s, at_s) if is_stable_at(middle_s) == stable else (inner_s, middle_s)
-            return (inner_s + at_s) / 2.0
+        inner_s, at_s = at_s, max(0.0, at_s + step_s)
+        if (growth(at_s) < 0.0) != stable:
+            return float(brentq(growth, inner_s, at_s, xtol=resolution * abs(step_s)))
         if at_s == 0.0:
             break
     return end_s
@@ -240,8 +250,9 @@ def breaking_factor(plan: FlightPlan, block: CoupledBlock) -> float:
     if block.margin_s() == inf:
         return inf
 
-    def is_stable_at(factor: float) -> bool:
-        return _is_stable(block, {own: factor * at_s for own, at_s in own_s.items()})
+    @cache
+    def growth(factor: float) -> float:
+        return _sign(block, {own: factor * at_s for own, at_s in own_s.items()})
 
-    stable, step = is_stable_at(1.0), _STEP * block.margin_s() / max(own_s.values())
-    return _edge_s(is_stable_at, 1.0, step if stable else -step, end_s=inf if stable else 0.0, stable=stable)
+    stable, step = growth(1.0) < 0.0, _STEP * block.margin_s() / max(own_s.values())
+    return _edge_s(growth, 1.0, step if stable else -step, end_s=inf if stable else 0.0)

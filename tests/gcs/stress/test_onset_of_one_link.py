@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from gcs import fly_virtual
 from gcs.cli.main import app
 from gcs.errors import InputError
-from gcs.plan.loops import plan_loops, plan_over_links
+from gcs.plan.loops import growth_of, plan_loops, plan_over_links, window_of
 from gcs.plan.planner import flight_plan, over_own_links
 from gcs.preflight.check import check
 from gcs.stress.measure import fly_trial
@@ -81,6 +81,13 @@ def test_a_loop_with_unlike_links_breaks_where_its_model_does() -> None:
     assert onset.loop_delay_s == pytest.approx(onset.predicted_s, rel=5e-4)  # measured: 1e-4
     assert onset.checks == ()  # there is no other loop
     assert [own.verdict for own in onset.own] == ["stable", "unstable"]  # both past the margin of equal links
+
+
+def test_the_window_of_a_link_ends_where_growth_is_zero() -> None:
+    plan = flight_plan(load(located("chain3_bidirectional")).with_calm_monitor())[1]
+    for vehicle in (1, 2, 3):
+        # a step of the search is 30 ms, and the growth rate changes by some 1.5 1/s a second here
+        assert abs(growth_of(plan, vehicle)(window_of(plan, vehicle)[1])) < 1e-6
 
 
 def test_the_vehicle_that_waits_is_the_slowest_of_its_loop() -> None:
