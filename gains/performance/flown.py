@@ -49,6 +49,11 @@ class FlownTiming:
 
     >>> FlownTiming(0.3, 0.02).delays_s(0.1), FlownTiming(0.3, 0.02, "onboard").delays_s(0.1)
     ((0.11, 0.11), (0.0, 0.11))
+
+    A continuous margin of 1.25 s, less half a hold of 1 s, is less than the sampled one, 0.8 s:
+
+    >>> [FlownTiming(0.8, 1.0, delay_margin_continuous_s=1.25).is_misjudged(delay_s) for delay_s in (0.7, 0.78, 0.8)]
+    [False, True, False]
     """
 
     delay_margin_s: float
@@ -68,11 +73,7 @@ class FlownTiming:
         return (late_s if self.all_late else self.step_s / 2.0), late_s
 
     def is_misjudged(self, delay_s: float) -> bool:
-        """Whether half a hold as delay makes the loop unstable at a loop delay (s) at which the sampled one is stable.
-
-        >>> FlownTiming(0.8, 1.0, delay_margin_continuous_s=1.25).is_misjudged(0.78)
-        True
-        """
+        """Whether half a hold as delay makes a loop unstable at a loop delay (s) at which the sampled one is stable."""
         late_s = self.delays_s(delay_s)[1]
         return self.all_late and self.delay_margin_continuous_s <= late_s and delay_s < self.delay_margin_s
 

@@ -51,19 +51,21 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
     unknown = FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
     if delay_s is None or design.vehicles < 2 or design.margin_unknown:
         return unknown
+    discrete = False
     if _is_predicted(design):
         followers = _predicted_followers(design, delay_s, gain_set)
         alphas, peaks = [own.alpha_at_delay for own in followers], [own.string_peak for own in followers]
     else:
         flown, chains = _flown(design, scenario, gain_set)
         alphas, peaks = [own.alpha(delay_s) for own in flown], [own.string_peak(delay_s) for own in chains]
-        if any(own.timing.is_misjudged(delay_s) for own in flown):
-            return FiguresAtDelay(loop_delay_s=delay_s, alpha=min(alphas), discrete=True, has_string_verdict=False)
+        if discrete := any(own.timing.is_misjudged(delay_s) for own in flown):
+            peaks = []
     if not alphas:
         return unknown
     return FiguresAtDelay(
         loop_delay_s=delay_s,
         alpha=min(alphas),
+        discrete=discrete,
         has_string_verdict=bool(peaks),
         string_peak=plain(max(peaks)) if peaks else None,
     )

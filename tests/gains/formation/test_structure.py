@@ -114,7 +114,7 @@ def test_wrong_matrices_are_named(matrices: dict[str, FloatArray], message: str)
         square_matrices(**matrices)
 
 
-def test_fixed_roots_go_block_by_block_and_the_other_roots_stay() -> None:
+def test_fixed_roots_go_block_by_block_and_others_stay() -> None:
     # two rings of consensus, the second driven by the first, and a lag: two common values go
     ring = np.array([[-2.0, 1.0, 1.0], [1.0, -2.0, 1.0], [1.0, 1.0, -2.0]])
     A1 = np.zeros((7, 7))

@@ -172,7 +172,7 @@ def test_a_zero_root_without_equilibrium_is_left_out_and_reported() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [0.5, 1.2])
-def test_given_delays_leave_out_the_zero_root_of_cancelled_feedback(delay_s: float) -> None:
+def test_given_delays_leave_out_roots_fixed_at_zero(delay_s: float) -> None:
     # s - 1 + e^{-s tau}: the second real root passes zero at tau = 1
     text = f'{{"terms": [{{"A": [[1]], "delay": 0}}, {{"A": [[-1]], "delay": {delay_s}}}]}}'
     result = margin_fields(loop_margin(parse_model(text)))
@@ -193,7 +193,7 @@ def test_given_delays_report_the_rightmost_of_two_unstable_roots() -> None:
 
 
 @pytest.mark.parametrize("gain", [1.0, 3.0, 1e-6, 1e6])
-def test_roots_on_the_axis_at_a_given_delay_are_not_stable(gain: float) -> None:
+def test_roots_on_the_axis_at_given_delays_are_unstable(gain: float) -> None:
     text = f'{{"terms": [{{"A": [[-{gain!r}]], "delay": {pi / (2.0 * gain)!r}}}]}}'
     assert margin_fields(loop_margin(parse_model(text)))["stable"] is False
 

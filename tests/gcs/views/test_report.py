@@ -32,7 +32,7 @@ def test_margins_of_single_vehicles_are_not_mistaken_for_slower_gains() -> None:
     assert "; margin 390.0 to 503.7 ms by vehicle; " in flight_lines(fly_virtual(scenario).summary)["delay"]
 
 
-def test_one_vehicle_alone_is_not_given_the_figures_of_a_follower(capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_vehicle_alone_has_figures_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     """e' = K1 e + w stays stable for any w smaller than −K1 times e, and decays at −K1."""
     chain = load(located("chain3"))
     design = with_trade_off(flight_plan(chain.model_copy(update={"vehicles": chain.leader_first()[:1]}))[0])
