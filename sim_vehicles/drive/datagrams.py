@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenarios.kernel import array_kernel, int64, kernel
-from scenarios.sockets import Batch, Bytes, Ints, joined
+from scenarios.sockets import Bytes, Ints, joined
 from sim_vehicles.services.frames import PAYLOAD, first_message
-from sim_vehicles.services.mavlink import TARGETS, TO_ALL, TO_NONE
+from sim_vehicles.services.mavlink import TO_ALL, TO_NONE
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
@@ -42,18 +42,15 @@ def datagrams_of(datagrams: Sequence[Datagram], rows: Mapping[int, int]) -> Data
     return Datagrams(stream, np.array(numbers, np.int64), [*rows])
 
 
-def to_vehicles(batch: Batch, behind: Ints, wire_ids: Ints) -> Ints:
-    """The table of `Datagrams` for what was read from the vehicles' sockets.
+@array_kernel
+def to_vehicles(stream: Bytes, table: Ints, behind: Ints, wire_ids: Ints, targets: Ints) -> Ints:
+    """The table of `Datagrams` for a `Batch` that was read from the vehicles' sockets.
 
     Behind the socket with descriptor d are the vehicles in the rows from `behind[d, 0]` up to `behind[d, 1]`, whose
-    MAVLink system ids are in `wire_ids`. If they are several, a frame goes to the one that is its target, and a
-    heartbeat or a frame to system 0 to all; what concerns no vehicle goes to the first, which counts it.
+    MAVLink system ids are in `wire_ids`. If they are several, a frame goes to the one that is its target (`targets` is
+    `services.mavlink.TARGETS`), and a heartbeat or a frame to system 0 to all; what concerns no vehicle goes to the
+    first, which counts it.
     """
-    return _to_vehicles(batch.stream, batch.table, behind, wire_ids, TARGETS)
-
-
-@array_kernel
-def _to_vehicles(stream: Bytes, table: Ints, behind: Ints, wire_ids: Ints, targets: Ints) -> Ints:
     count, total = table.shape[1], 0
     rows = np.empty((count, 2), np.int64)
     for k in range(count):

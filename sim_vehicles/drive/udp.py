@@ -18,6 +18,7 @@ from scenarios.schema import NS_PER_S
 from scenarios.sockets import NO_ADDRESS, Batch, Bytes, Ints, Reader, joined, number_of, stamped, write
 from scenarios.undisturbed import undisturbed
 from sim_vehicles.drive.datagrams import Datagram, Datagrams, datagrams_of, to_vehicles
+from sim_vehicles.services.mavlink import TARGETS
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """The loop busy-waits for this long before a due time, because with few vehicles late wake-ups are most of the error.
@@ -158,7 +159,8 @@ class Ports:
     def receive(self) -> Datagrams:
         """The datagrams that have arrived, with the times at which they reached this host."""
         batch = self.sockets.receive()
-        return Datagrams(batch.stream, to_vehicles(batch, self._behind, self._wire_ids), self._system_ids)
+        table = to_vehicles(batch.stream, batch.table, self._behind, self._wire_ids, TARGETS)
+        return Datagrams(batch.stream, table, self._system_ids)
 
     def send(self, datagrams: Datagrams | list[Datagram]) -> None:
         if not isinstance(datagrams, Datagrams):
