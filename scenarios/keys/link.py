@@ -208,5 +208,5 @@ class Links(Part):
     start."""
     one_port: bool = False
     """Whether the vehicles of each network share one UDP port, as behind a radio or a router, instead of having one
-    each. In real time, frames that are due together then travel in one datagram of up to 1400 bytes, and the station
-    sends one heartbeat for all of them. Each frame still has its own fate on its vehicle's link."""
+    each. In real time, frames that are due together then travel in one datagram of up to 1400 bytes. Delay, loss and
+    all else still happen to each frame by itself."""

@@ -326,6 +326,7 @@ def _links(rng: Rng, system_ids: list[int], duration_s: float) -> Part:
         ],
         channels=channels,
         times_from=one_of(rng, "flight", "start"),
+        one_port=chance(rng, 0.5),
     )
 
 

@@ -160,7 +160,7 @@ def targets_and_heartbeats(own: Address) -> tuple[list[int], int]:
     return [data[10 + 16] if data[1] > 16 else 0 for data in requests], sum(data[7:10] == bytes(3) for data in sent)
 
 
-def test_vehicles_at_one_port_share_heartbeats_and_are_asked_by_name() -> None:
+def test_vehicles_at_one_port_share_heartbeats_and_are_named() -> None:
     targets, heartbeats = targets_and_heartbeats(HOME)
     assert (set(targets), heartbeats) == ({1, 2, 3}, 5)
     targets, heartbeats = targets_and_heartbeats(address_at("127.0.0.1", 6666))
