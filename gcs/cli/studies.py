@@ -131,8 +131,7 @@ def bench(
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
     if one_port:
-        links = scenario.links.model_copy(update={"one_port": True})
-        scenario = scenario.model_copy(update={"links": links})
+        scenario = scenario.with_keys(links={"one_port": True})
     options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     if peers or cluster:
         options.refuse(scenario_file, benchmark.first_unsupported_key(scenario))
