@@ -67,6 +67,7 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
     control_hz, telemetry_hz = (max(own, LEAST_RATE_HZ) for own in (rates.control_hz, rates.telemetry_hz))
     alone = scenario.in_steady_flight().with_calm_monitor().model_copy(update=changes)
     alone = alone.at_rates(control_hz=control_hz, telemetry_hz=telemetry_hz)
+    alone = alone.with_keys(safety={"setpoint_timeout_s": alone.duration_s})  # it is the response that is looked for
     flight = fly_plan(flight_plan(alone)[1], with_truth=True)
     assert flight.truth is not None
     rows = flight.ticks[flight.ticks["commanded"]]

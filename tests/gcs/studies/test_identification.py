@@ -52,11 +52,12 @@ def test_a_known_lag_is_found_again(tmp_path: Path) -> None:
 
 
 def test_a_known_lag_is_found_at_a_slow_control_rate(tmp_path: Path) -> None:
-    """At 1 Hz the flight would have 32 samples, and set-points as rare as the timeout of the failsafe."""
+    """At 1 Hz the flight would have 32 samples, and set-points rarer than the timeout of the failsafe."""
     (tmp_path / "lagged.py").write_text(LAGGED)
     file = tmp_path / "lagged.toml"
     file.write_text(
         TEXANS.replace('"jsbsim"', '"lagged.py:step"') + "rates = { control_hz = 1.0, telemetry_hz = 1.0 }\n"
+        "safety = { setpoint_timeout_s = 0.08 }\n"
     )
     found = responses_of(load(file))
     for own in found.values():
