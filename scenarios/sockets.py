@@ -111,7 +111,8 @@ class Reader:
     """Reads sockets that are `stamped`, at most `most_of_each` datagrams from each at once.
 
     With `together`, MAVLink frames share datagrams: `write` sends consecutive frames to one address in one datagram,
-    and frames that came in one datagram are read as if each had come in its own.
+    and frames that came in one datagram are read as if each had come in its own. What is not exactly one frame, as when
+    a link has flipped bits in its header, travels alone: readers would not find the frames behind it.
     """
 
     def __init__(self, most_of_each: int = MOST_DATAGRAMS, *, together: bool = False) -> None:
@@ -264,6 +265,13 @@ def _frame_bytes(stream: Bytes, begin: int, end: int) -> int:
 
 
 @kernel
+def _is_frame(stream: Bytes, begin: int, end: int) -> bool:
+    """Whether these bytes are exactly one frame, as far as its size tells."""
+    size = _frame_bytes(stream, begin, end)
+    return size > 0 and size == end - begin
+
+
+@kernel
 def _frames(stream: Bytes, begin: int, end: int) -> int:
     """How many frames fill a datagram without a gap; 1 if it holds anything else."""
     frames, place = 0, begin
@@ -288,6 +296,8 @@ def write_all(
             and descriptors[stop] == descriptors[first]
             and addresses[stop] == addresses[first]
             and size + ends[stop] - begins[stop] <= len(buffers.together)
+            and _is_frame(stream, begins[first], ends[first])
+            and _is_frame(stream, begins[stop], ends[stop])
         ):
             size += ends[stop] - begins[stop]
             stop += 1

@@ -79,6 +79,19 @@ def test_frames_together_go_only_to_one_address(two: tuple[socket.socket, socket
     assert [one.recv(2048), other.recv(2048), one.recv(2048)] == [data[0], data[1], data[2]]
 
 
+@pytest.mark.parametrize(("place", "value"), [(0, 0xFC), (0, 0xFE), (1, 15), (1, 255), (2, 1)])
+def test_a_frame_with_flipped_bits_in_its_header_spoils_no_other(
+    two: tuple[socket.socket, socket.socket], place: int, value: int
+) -> None:
+    one, other = two
+    data = frames_of(10, 20, 14, 30, 40)
+    data[2] = data[2][:place] + bytes([value]) + data[2][place + 1 :]
+    stream, ends = joined(data)
+    to, reader = np.full(len(data), number_of(other.getsockname())), Reader(together=True)
+    write(stream, ends[:-1], ends[1:], np.full(len(data), one.fileno()), to, reader.buffers)
+    assert [found.data for found in reader.read([other.fileno()])] == data
+
+
 @pytest.mark.parametrize("spoiled", [b"", b"\xfd", b"\xfd\xff\x00", b"noise", b"\xfe\x30" + bytes(8)])
 def test_what_is_not_frames_alone_is_read_whole(two: tuple[socket.socket, socket.socket], spoiled: bytes) -> None:
     one, other = two
