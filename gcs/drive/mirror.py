@@ -70,15 +70,18 @@ class Mirror:
         """The permitted frames of the other station, each for the vehicle it is addressed to, or for all.
 
         They go only to vehicles that are, or were, in guided flight: one that was never commanded would accept the
-        other station as its own. Requests that change the rate of the telemetry used for control are refused, because
+        other station as its own. A frame for all is heard by all vehicles at a port: it is sent there once, and only
+        if all of them may get it. Requests that change the rate of the telemetry used for control are refused, because
         displays ask for only a few positions a second when they connect.
         """
         own = {v.wire_id: v.address if v.guided or v.has_been_guided else None for v in vehicles}
+        barred = {v.address for v in vehicles if own[v.wire_id] is None}
+        to_all = [address for address in dict.fromkeys(own.values()) if address is not None and address not in barred]
         outgoing: list[Outgoing] = []
         for frame in self._received(now_ns):
             name = mavlink.message_name(frame.msg_id)
             target = mavlink.target_system(frame)
-            addresses = [address for system_id, address in own.items() if target in (0, system_id) and address]
+            addresses = to_all if target == 0 else [address for address in (own.get(target),) if address is not None]
             if not self._commands:
                 self.counters[f"refused {name}"] += 1
             elif frame.system_id in own or not addresses:

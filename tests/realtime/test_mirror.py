@@ -230,6 +230,27 @@ def test_a_vehicle_that_left_guided_flight_is_not_cut_off() -> None:
                 assert [data for data, _ in mirror.passed_on([vehicle], 0)] == passed_on
 
 
+def test_vehicles_at_one_port_get_what_is_for_all_once_and_only_after_all_were_commanded() -> None:
+    vehicles = [RemoteVehicle(number, startup=LaunchedStartup(1.0)) for number in (1, 2, 3)]
+    for vehicle, address in zip(vehicles, (9, 9, 8), strict=True):
+        vehicle.address, vehicle.armed = address, True
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with Mirror(*other.getsockname(), commands=True) as mirror:
+            mirror.forward([b"hello"], 0)
+            _, address = other.recvfrom(2048)
+            beat = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0)
+            to_1 = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(1, target_system=1), sequence=0)
+            passed: list[list[tuple[bytes, int]]] = []
+            for guided in ([], [0, 2], [0, 1, 2]):
+                for row in guided:
+                    vehicles[row].custom_mode = vehicles[row].kind.guided_mode
+                other.sendto(beat, address)
+                other.sendto(to_1, address)
+                passed.append(mirror.passed_on(vehicles, 0))
+    assert passed == [[], [(beat, 8), (to_1, 9)], [(beat, 9), (beat, 8), (to_1, 9)]]
+
+
 def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = 9, True, vehicle.kind.guided_mode
