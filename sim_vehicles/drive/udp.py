@@ -168,7 +168,7 @@ class Ports:
         table = datagrams.table.copy()
         table[2] = self._numbers[table[2]]
         if len(self._numbers) > self.sockets.count:
-            table = table[:, table[2].argsort(kind="stable")]  # those of one socket travel together
+            table = table.take(table[2].argsort(kind="stable"), axis=1)  # those of one socket travel together
         self.sockets.send(datagrams.stream, table)
 
 

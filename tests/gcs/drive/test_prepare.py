@@ -66,3 +66,24 @@ assert compiled() == before, {name: count for name, count in compiled().items() 
 def test_nothing_is_compiled_in_a_flight_in_real_time() -> None:
     beginning = FLIGHT[: FLIGHT.index("name, prediction")]
     subprocess.run([sys.executable, "-c", beginning + IN_REAL_TIME], check=True)
+
+
+AT_ONE_PORT = """
+import socket
+from sim_vehicles.drive.udp import Ports
+
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+    station.bind(("127.0.0.1", 0))
+    ports = Ports((1, 2), station.getsockname(), one_port=True)
+    before = compiled()
+    assert "scenarios.sockets.write_all" in before
+    ports.send([(1, b"one", 0), (2, b"two", 0)])
+    ports.receive()
+assert compiled() == before, {name: count for name, count in compiled().items() if before.get(name) != count}
+"""
+
+
+@pytest.mark.realtime
+def test_vehicles_at_one_port_compile_nothing_when_they_first_send() -> None:
+    beginning = FLIGHT[: FLIGHT.index("name, prediction")]
+    subprocess.run([sys.executable, "-c", beginning + AT_ONE_PORT], check=True)
