@@ -28,8 +28,9 @@ GOODBYE_NS = NS_PER_S
 """Time the program runs on after the last vehicle was told to shut down, so that its answer leaves the links."""
 
 DESCRIPTION = """\
-Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
-They stay on the launcher, or on the ground, until a MAVLink ground station arms and commands them.
+Fly the vehicles of a scenario: each is a MAVLink system of its own, behind emulated links. Each has its own UDP port,
+or those of a network share one if the scenario sets links.one_port. They stay on the launcher, or on the ground, until
+a MAVLink ground station arms and commands them.
 
 With --links-only no vehicle is simulated: MAVLink vehicles that send to a --vehicle-port get the scenario's links for
 their system ids, and the station hears each vehicle from a port of its own."""
