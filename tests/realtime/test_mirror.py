@@ -230,7 +230,7 @@ def test_a_vehicle_that_left_guided_flight_is_not_cut_off() -> None:
                 assert [data for data, _ in mirror.passed_on([vehicle], 0)] == passed_on
 
 
-def test_vehicles_at_one_port_get_what_is_for_all_once_and_only_after_all_were_commanded() -> None:
+def test_one_port_gets_frames_for_all_once_all_are_commanded() -> None:
     vehicles = [RemoteVehicle(number, startup=LaunchedStartup(1.0)) for number in (1, 2, 3)]
     for vehicle, address in zip(vehicles, (9, 9, 8), strict=True):
         vehicle.address, vehicle.armed = address, True

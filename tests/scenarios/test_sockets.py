@@ -80,7 +80,7 @@ def test_frames_together_go_only_to_one_address(two: tuple[socket.socket, socket
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 0xFC), (0, 0xFE), (1, 15), (1, 255), (2, 1)])
-def test_a_frame_with_flipped_bits_in_its_header_spoils_no_other(
+def test_a_frame_with_flipped_bits_hides_no_other(
     two: tuple[socket.socket, socket.socket], place: int, value: int
 ) -> None:
     one, other = two
