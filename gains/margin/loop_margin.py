@@ -225,7 +225,7 @@ def fixed_note(fixed: int, where: str) -> tuple[str, ...]:
     stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
     why = "a motion that the loop does not bring back, such as the common value of a consensus"
     if fixed > 1:
-        why = f"{why}; one that drives another makes it grow with time"
+        why = f"{why}; if one of them drives another, it lets the other grow with time"
     return (f"{stay} at {where} ({why}); everything else is about the other roots",) if fixed else ()
 
 

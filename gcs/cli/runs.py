@@ -39,7 +39,7 @@ def print_grade(result: "Grade") -> None:
         p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
         print(f"{title:<32} p50 {p50}  p99 {p99}  max {largest}  of {own.samples}")
     if result.down_jitter.error_max_s:
-        print("a loop delay is also off by as much as the last TIMESYNC request took more or less than its set-point")
+        print("a loop delay is also off by the difference in delay between the last TIMESYNC request and its set-point")
 
 
 def view(

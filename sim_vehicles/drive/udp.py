@@ -71,6 +71,7 @@ class Sockets:
 
     @property
     def count(self) -> int:
+        """How many sockets are open."""
         return len(self._sockets)
 
     def close(self) -> None:
